@@ -1,10 +1,10 @@
-"""The table of a campaign: errors of each parameter in standard deviations by theory, and how often intervals cover."""
+"""Table of a campaign: errors of each parameter in standard deviations by theory, and coverage of intervals."""
 
 import numpy as np
 
 
 def print_errors(names, errors, covered, **more):
-    """Print bias with its Monte Carlo error, scatter, coverage [%], and further columns of one number a parameter."""
+    """Print bias with its Monte Carlo error, scatter, coverage [%], and further columns with a number per parameter."""
     print("parameter      bias  (+-)  scatter  coverage" + "".join(f"  {title}" for title in more))
     errors, shares = np.asarray(errors), 100 * np.mean(covered, axis=0)
     scatter = errors.std(axis=0, ddof=1)

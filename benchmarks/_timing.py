@@ -1,6 +1,6 @@
-"""What every benchmark shares: one thread for linear algebra, processor time, and calls that take turns.
+"""Common parts of the benchmarks: one thread for linear algebra, processor time, and alternating calls.
 
-To be imported before numpy, whose threads are counted when it is loaded.
+Import it before numpy, which sets its threads when it is loaded.
 """
 
 import os
@@ -14,20 +14,20 @@ import numpy as np
 
 
 def cpu(function, *arguments):
-    """Processor time of a call [s], which neighbours on the same cores disturb least, and what it returns."""
+    """Return the processor time of a call [s], which other processes disturb least, and its result."""
     begun = time.process_time()
     result = function(*arguments)
     return time.process_time() - begun, result
 
 
 def least(repeats, *calls):
-    """Least processor time of each call [s]; they take turns, so that a disturbance meets all of them."""
+    """Return the least processor time of each call [s]; they alternate, so that a disturbance affects all of them."""
     for call in calls:
-        call()  # compiles, or loads what was compiled
+        call()  # compiles, or loads the compiled function
     return np.min([[cpu(call)[0] for call in calls] for _ in range(repeats)], axis=0)
 
 
 def cpu_of_children():
-    """Processor time of all processes that were started and have ended [s]."""
+    """Return the processor time of all child processes that have ended [s]."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime

@@ -1,17 +1,17 @@
-"""What each start, stage and special case of the search for the optimum is worth.
+"""Contribution of each start, stage and special case to the search for the optimum.
 
     python benchmarks/bench_ablation.py [--systems 100] [--seed 1] [--records FOLDER] [--configs] [--only NAME ...]
         [--costs FILE]
 
-Every problem is solved with all of the optimiser and once without each of its parts. A part is worth the problems that
-then end above the least cost that any variant has reached, by more than a millionth, and costs the time that leaving it
-out saves. ``--costs`` keeps the least costs in a file, so that later runs with less code are compared with them too.
+Every problem is solved with the whole optimiser and once without each of its parts. The benefit of a part is the number
+of problems that end above the least cost of all variants by more than a millionth without it; its price is the time
+saved without it. ``--costs`` keeps the least costs in a file, so that later runs with less code are compared with them.
 
-Random systems have a regular or an irregular clock, an input of random steps or of one narrow band, and a delay that
-is known, or searched within 12 or 100 sampling intervals. The three ways to an estimate take turns: with smaller models
-and random starts (``nested``, 1 to 3 poles), from the minima of the profile over the delay (``profile``, at rest, 1 to
-6 poles), and as the search for orders does (``orders``, 1 to 6). A part is left out only where it can be met, and
-problems that none of the parts of ``--only`` can meet are left out.
+Random systems have a regular or an irregular clock, an input of random steps or of one narrow band, and a delay that is
+known, or searched within 12 or 100 sampling intervals. Three kinds of search alternate: with smaller models and random
+starts (``nested``, 1 to 3 poles), from the minima of the profile over the delay (``profile``, at rest, 1 to 6 poles),
+and as in the search for orders (``orders``, 1 to 6). A part is left out only where it applies, and problems to which
+none of the parts of ``--only`` applies are left out.
 ``--records`` adds measured records (see bench_optimum.py), ``--configs`` data sets of the useful-redundancy study.
 """
 
@@ -61,7 +61,7 @@ def random_poles(rng, count, slowest, fastest):
 
 
 def random_problem(rng, way):
-    """An estimator and a record that it is to fit."""
+    """Return an estimator and a record to fit."""
     most = int(rng.integers(1, 4)) if way == "nested" else 6
     n, samples, latest = int(rng.integers(1, most + 1)), int(rng.integers(200, 400)), int(rng.choice([0, 12, 100]))
     m = int(rng.integers(0, min(n, 4)))
@@ -95,7 +95,7 @@ def random_problem(rng, way):
 
 
 def study_problems(count):
-    """First data sets of the useful-redundancy study."""
+    """Return the first data sets of the useful-redundancy study."""
     for name in ("case1_regular", "case1_irregular", "case2_regular", "case2_irregular"):
         plan = build_plan(load_spec(CONFIGS / f"{name}.yaml"))
         estimator = next(cell.estimator for cell in plan.estimators if cell.name == "delay_profile")
@@ -105,7 +105,7 @@ def study_problems(count):
 
 
 def problems(asked):
-    """Names, estimators, records and ways to the estimate."""
+    """Return names, estimators, records and kinds of search."""
     if asked.configs:
         yield from study_problems(2)
     for name, record in measured(asked.records) if asked.records else ():
@@ -121,7 +121,7 @@ def problems(asked):
 
 
 def solved(options, record, way):
-    """The least squared error that was found."""
+    """Return the least squared error found."""
     if way == "orders":
         problem = options.prepare(record).laid_out.problem
         searched = StructureSearch(problem, box.box_of(problem, options.delay_bounds), effort=QUICK)
@@ -138,13 +138,13 @@ def nothing(*_, **__):
 
 
 def otherwise(owner, name, changed):
-    """A patch whose function is told the original first."""
+    """Return a patch whose function gets the original as its first argument."""
     original = getattr(owner, name)
     return patch.object(owner, name, lambda *given, **named: changed(original, *given, **named))
 
 
 def without_edges():
-    """Pairs at the greatest imaginary part keep the coordinates of the others."""
+    """Give pairs at the greatest imaginary part the coordinates of the others."""
 
     def changed(original, *given):
         point = original(*given)
@@ -154,7 +154,7 @@ def without_edges():
 
 
 def by_scipy(descent, start, known=(), near=search.NEAR, most_steps=search.MOST_STEPS):
-    """The refinement by ``scipy.optimize.least_squares`` within the box of the logarithmic coordinates."""
+    """Refine by ``scipy.optimize.least_squares`` within the box of the logarithmic coordinates."""
     for _ in range(3):
         begin, seen = descent.local(start), {}
 
@@ -162,7 +162,7 @@ def by_scipy(descent, start, known=(), near=search.NEAR, most_steps=search.MOST_
             key = x.tobytes()
             if key not in seen:
                 here = descent.local(box.moved_by(begin.point, x, descent.box))
-                # Few rows with the same cost, gradient and curvature as the residuals.
+                # A few rows with the same cost, gradient and curvature as the residuals.
                 values, vectors = np.linalg.eigh(here.curvature)
                 roots = np.sqrt(np.maximum(values, 1e-14 * max(values.max(initial=0.0), 1e-300)))
                 along = vectors.T @ here.gradient / roots
@@ -205,7 +205,7 @@ def by_scipy(descent, start, known=(), near=search.NEAR, most_steps=search.MOST_
 
 
 def variants():
-    """What is left out: what a problem must have for that to matter, and the patches that do so."""
+    """Return what is left out: the properties of a problem for which it matters, and the patches."""
     return {
         "nothing": (set(), []),
         "poles by themselves": (
@@ -250,7 +250,7 @@ def variants():
 
 
 def properties(options, record, way):
-    """What a problem has that some parts are for."""
+    """Return the properties of a problem to which some parts apply."""
     has = {way, "regular" if record.interval else "irregular"}
     low, high = options.delay_bounds
     filtered = options.initial_state == "rest" and options.offset != "estimate" and way != "orders"

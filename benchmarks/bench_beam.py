@@ -1,7 +1,7 @@
-"""Is a simulated flexible beam found with its delay unknown, from the initial values that were printed for it?
+"""Search for a simulated flexible beam with unknown delay, from its printed initial values.
 
 The modes, the clock and the start are those of ``configs/additive/flexible_beam.yaml``; the delay of four samples is
-searched between 0 and 2 ms. Found: the squared output error is below 1.2 times that of the noise.
+searched between 0 and 2 ms. The beam is found if the squared output error is below 1.2 times that of the noise.
 
     python benchmarks/bench_beam.py SEED RUNS SNR_DB
 
@@ -21,16 +21,16 @@ from ctid_cli.signals.record import Record
 
 MODE = Term(2, 0)
 DELAY, SAMPLES, RATE, TONES = 9.765625e-4, 8192, 4096.0, 1000
-#: a1, a2 and b0 of each mode, and where the search starts.
+#: a1, a2 and b0 of each mode, and the start of the search.
 SYSTEM = [0.0024, 0.023, 11.81, 2.33e-5, 1.65e-4, 0.159, 8.59e-7, 1.03e-5, 3.19e-4, 7.55e-7, 3.55e-6, 1.27e-4]
 START = [0.001, 0.025, 10.0, 5e-5, 1.5e-4, 0.2, 8.5e-7, 2e-5, 0.001, 7.5e-7, 5e-6, 0.01]
 ESTIMATOR = AdditiveOutputError((MODE,) * 4, (0.0, 2e-3), covariance="white")
-#: Squared output error over that of the noise, and error of the delay [s], up to which beam and delay are found.
+#: Squared output error over that of the noise, and error of the delay [s], up to which beam and delay count as found.
 FOUND, CLOSE = 1.2, 1e-6
 
 
 def one(rng: np.random.Generator, snr_db: float) -> tuple[float, float]:
-    """Return the squared output error over that of the noise, and the error of the delay, of one record."""
+    """Return the squared output error over that of the noise, and the error of the delay, for one record."""
     system = AdditiveModel.from_theta(SYSTEM, (MODE,) * 4, DELAY)
     t, w = np.arange(SAMPLES) / RATE, np.pi * np.arange(1, TONES + 1)
     phases = rng.uniform(0, 2 * np.pi, TONES)
@@ -42,7 +42,7 @@ def one(rng: np.random.Generator, snr_db: float) -> tuple[float, float]:
 
 
 def main(seed: int = 20261126, runs: int = 20, snr_db: float = 100.0) -> None:
-    """Print how often the beam, and its delay, is found."""
+    """Print how often the beam, and its delay, are found."""
     rng = np.random.default_rng(seed)
     records = []
     for k in range(runs):

@@ -3,7 +3,7 @@
     python benchmarks/bench_bias_coverage.py --systems first second samples integrator --size 600 --records 300
     python benchmarks/bench_bias_coverage.py --systems common own --size 600 --records 300
 
-All delays are searched. Every record is searched in the basin of the true model, the first of them globally too. With
+All delays are searched. Every record is searched in the basin of the true model, the first one also globally. With
 ``--out FILE`` the estimates, standard errors and quantiles are added to a file, one line of JSON for each record.
 """
 
@@ -30,14 +30,14 @@ from ctid_cli import (
 from ctid_cli.estimators.delay_profile import MeasuredFit, fitted
 from ctid_cli.estimators.frequency_domain import fit_of
 
-#: Frequency responses: model, degrees, integrators and sampling interval; 0 is G(jw).
+#: Frequency responses: model, degrees, integrators and sampling interval; 0 for G(jw).
 RESPONSES = {
     "first": (TransferFunction([2.0], [1.0, 1.0], 0.7), 1, 0, 0, 0.0),
     "second": (TransferFunction([2.0, 4.0], [1.0, 1.0, 4.0], 0.73), 2, 1, 0, 0.0),
     "samples": (TransferFunction([2.0, 4.0], [1.0, 1.0, 4.0], 0.73), 2, 1, 0, 0.2),
     "integrator": (TransferFunction([4.0], [1.0, 2.0, 0.0], 0.33), 1, 0, 1, 0.1),
 }
-#: Records with two inputs: the model of each, and what is fitted.
+#: Records with two inputs: the model of each, and the fitted structure.
 TWO_INPUTS = {
     "common": (
         (TransferFunction([1.0, 2.0], [1.0, 1.2, 1.0], 0.73), TransferFunction([-1.5], [1.0, 1.2, 1.0], 1.26)),
@@ -50,12 +50,12 @@ TWO_INPUTS = {
 }
 INTERVAL, SNR_DB = 0.1, 15.0
 
-#: Makes the data of one record from its random numbers.
+#: Function that makes the data of one record from its random numbers.
 Maker = Callable[[np.random.Generator], FrequencyData | Record]
 
 
 def response_of(name: str, count: int, unknown: bool) -> tuple[FrequencyDomain, Maker]:
-    """Exact values with noise whose standard error is three times as large at the highest line."""
+    """Return exact values with noise whose standard error is three times as large at the highest line."""
     model, poles, zeros, integrators, interval = RESPONSES[name]
     highest = 0.98 * np.pi / interval if interval else 20.0
     w = np.linspace(highest / count, highest, count)
@@ -77,7 +77,7 @@ def response_of(name: str, count: int, unknown: bool) -> tuple[FrequencyDomain, 
 
 
 def two_inputs(name: str, count: int) -> tuple[DelayProfile, Maker]:
-    """Records whose inputs are binary sequences that are drawn anew, with white noise."""
+    """Return records with new binary sequences as inputs, and white noise."""
     models, options = TWO_INPUTS[name]
     t = INTERVAL * np.arange(count)
 
@@ -93,7 +93,7 @@ def two_inputs(name: str, count: int) -> tuple[DelayProfile, Maker]:
 
 
 def near_truth(name: str, options: DelayProfile, measured: object) -> MeasuredFit:
-    """The fit in the basin of the true model."""
+    """Return the fit in the basin of the true model."""
     if name in RESPONSES:
         model, poles = RESPONSES[name][:2]
         return fit_of(measured, measured.local((model.denominator[: poles + 1], model.delay)))

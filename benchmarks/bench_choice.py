@@ -1,4 +1,4 @@
-"""How good is the model that `ctid fit` chooses, when nothing is told? Simulated records of known structure.
+"""Quality of the model that `ctid fit` chooses with default settings, on simulated records of known structure.
 
     python benchmarks/bench_choice.py FILE [--records 400] [--seed 20261126] [--first 0] [--steps 30]
 
@@ -7,13 +7,12 @@ of 3 samples to a fifteenth of the record, a delay of 0 or .3 to 10 samples, in 
 record, or an offset of the output; a binary input, one step, or a multisine; white noise or AR(1) of .5 to .95 at 5 to
 30 dB.
 
-The error of a model is the root mean square error of its noise-free output for a fresh input, from rest, over the
-standard deviation of the true one, with the hold that was chosen. References are errors of the true structure, hold
-told, or their root mean square over five redraws of the noise if that is larger: `chosen` in the treatment and range
-that were chosen, `true` in the true treatment. A line for each record goes to FILE (JSON); what is there is not
-computed again.
+The error of a model is the root mean square error of its noise-free output for a new input, from rest, over the
+standard deviation of the true one, with the chosen hold. References are errors of the true structure with known hold,
+or their root mean square over five redraws of the noise if that is larger: `chosen` with the chosen treatment and
+range, `true` with the true treatment. Each record adds a line to FILE (JSON); existing ones are not computed again.
 
-Then step records with a lead of 1, 5 and 15 samples, whose error is compared with that of the true structure from rest.
+Then step records with a lead of 1, 5 and 15 samples are compared with the true structure from rest.
 """
 
 import argparse
@@ -35,7 +34,7 @@ INTERVAL = 1.0
 REDRAWS = 5
 #: Range of the delay of the true structure in the true treatment, in samples.
 DELAYS = (0.0, 20.0)
-#: Leads of step records [samples], and the number from which on these are drawn.
+#: Leads of step records [samples], and the number from which on they are drawn.
 LEADS, FIRST_LEAD = (1, 5, 15), 10**6
 GROUPS: dict[str, Callable[["Case"], bool]] = {
     "all": lambda case: True,
@@ -56,7 +55,7 @@ GROUPS: dict[str, Callable[["Case"], bool]] = {
 
 @dataclass(frozen=True)
 class Case:
-    """What a record is drawn from; everything else follows from the seed and its number."""
+    """Properties of a record; everything else follows from the seed and its number."""
 
     seed: int
     number: int
@@ -98,7 +97,7 @@ class Case:
         return t - t[0]
 
     def input(self, rng: np.random.Generator, t: np.ndarray, past: int) -> np.ndarray:
-        """The input, of which some samples are before the record."""
+        """Return the input, including some samples before the record."""
         if self.kind == "multisine":
             phases = rng.uniform(0, 2 * np.pi, len(self.frequencies))
             waves = np.sin(np.outer(t, self.frequencies) + phases).sum(axis=1)
@@ -112,7 +111,7 @@ class Case:
 
     @cached_property
     def clean(self) -> Record:
-        """The record without noise and offset."""
+        """Record without noise and offset."""
         rng, past = self.rng(1), 0 if self.at_rest else int(4 * self.constant) + 20
         t = self.clock_of(rng, self.samples + past)
         u = self.input(rng, t, past)
@@ -121,7 +120,7 @@ class Case:
         return Record(t, x[past:], HeldSignal(t, u[past:], "zoh"), name=f"record {self.number}")
 
     def record(self, draw: int) -> Record:
-        """The record with a draw of the noise."""
+        """Return the record with a draw of the noise."""
         rng, x = self.rng(2, draw), self.clean.y
         e = rng.standard_normal(x.size + 200)
         for k in range(1, e.size) if self.colour else ():
@@ -131,7 +130,7 @@ class Case:
         return replace(self.clean, y=x + noise + self.offset * deviation)
 
     def error(self, model: TransferFunction, hold: str) -> float:
-        """Error of a model for a fresh input, from rest."""
+        """Return the error of a model for a new input, from rest."""
         rng = self.rng(3)
         t = self.clock_of(rng, self.samples)
         u = self.input(rng, t, 0)
@@ -140,7 +139,7 @@ class Case:
         return float(np.sqrt(np.mean((found - x) ** 2)) / np.std(x))
 
     def reference(self, options: DelayProfile) -> float:
-        """Error of the true structure with some options."""
+        """Return the error of the true structure with some options."""
         structure = {"poles": len(self.poles), "zeros": len(self.zeros), "integrators": self.integrators}
         errors = []
         for draw in range(1 + REDRAWS):
@@ -152,14 +151,14 @@ class Case:
 
     @property
     def true_treatment(self) -> DelayProfile:
-        """The true structure in its true treatment; the state of an integrator has an offset of the output."""
+        """True structure in its true treatment; the state of an integrator has an offset of the output."""
         state = "rest" if self.at_rest else "estimate"
         offset = "estimate" if self.has_offset and not (self.integrators and not self.at_rest) else "none"
         return DelayProfile(1, 0, DELAYS, initial_state=state, offset=offset, nested=True)
 
 
 def drawn(seed: int, number: int) -> Case:
-    """A record of the distribution."""
+    """Draw a record of the distribution."""
     rng = np.random.default_rng([seed, number])
     samples = round(float(np.exp(rng.uniform(np.log(300), np.log(1000)))))
     order, integrators = int(rng.integers(1, 5)), int(rng.random() < 0.25)
@@ -196,7 +195,7 @@ def drawn(seed: int, number: int) -> Case:
 
 
 def _poles(rng: np.random.Generator, count: int, constant: float) -> Iterator[complex]:
-    """The dominant pole, or pair, and modes up to six times faster."""
+    """Yield the dominant pole, or pair, and modes up to six times faster."""
     k = 0
     while k < count:
         speed = (1.0 if k == 0 else float(rng.uniform(1, 6))) / constant
@@ -211,7 +210,7 @@ def _poles(rng: np.random.Generator, count: int, constant: float) -> Iterator[co
 
 
 def measured(case: Case) -> dict[str, object]:
-    """Choose, and compare with the references."""
+    """Choose a model, and compare it with the references."""
     row: dict[str, object] = {"seed": case.seed, "number": case.number, "step": case.step}
     try:
         row["cpu_seconds"], choice = cpu(choose, case.record(0))
@@ -227,7 +226,7 @@ def measured(case: Case) -> dict[str, object]:
 
 
 def steps(seed: int, count: int) -> Iterator[Case]:
-    """Step records at rest with short leads."""
+    """Yield step records at rest with short leads."""
     found = filter(_is_step, (drawn(seed, number) for number in itertools.count(FIRST_LEAD)))
     for case, lead in zip(found, itertools.islice(itertools.cycle(LEADS), count), strict=False):
         yield replace(case, at_rest=True, step=lead)
@@ -238,7 +237,7 @@ def _is_step(case: Case) -> bool:
 
 
 def shares(name: str, rows: list[dict[str, object]], reference: str) -> str:
-    """How many errors are at most 1.25 and 2 times a reference."""
+    """Return the shares of errors of at most 1.25 and 2 times a reference."""
     ratios = np.array([np.inf if row["error"] is None else row["error"] / row[reference] for row in rows], dtype=float)
     return f"{name:16}{reference:8}{ratios.size:6}{100 * np.mean(ratios <= 1.25):8.1f}{100 * np.mean(ratios <= 2):8.1f}"
 

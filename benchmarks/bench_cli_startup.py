@@ -1,8 +1,8 @@
 """Start-up of `ctid --help` against the smallest Typer application with four commands, in processor time.
 
-Runs them by turns, each in a fresh interpreter, and prints the medians and their ratio. Exit code 1 if the ratio to
-the trivial application with its default settings exceeds 1.5. The ratio to one that, like ctid, prints plain help is
-printed too; it is the stricter comparison, since plain help leaves out the import of rich.
+Runs them alternately, each in a fresh interpreter, and prints the medians and their ratio. Exit code 1 if the ratio to
+the trivial application with its default settings exceeds 1.5. The ratio to one with plain help, like ctid's, is printed
+too; this comparison is stricter, since plain help avoids the import of rich.
 
     python benchmarks/bench_cli_startup.py [REPETITIONS]
 """
@@ -48,7 +48,7 @@ app()
 
 
 def measure(repetitions: int) -> dict[str, float]:
-    """Median seconds of each application's help."""
+    """Return the median seconds of each application's help."""
     with tempfile.TemporaryDirectory() as folder:
         rich = Path(folder, "rich_help.py")
         rich.write_text(TRIVIAL.format(options=""))
@@ -71,7 +71,7 @@ def measure(repetitions: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure, print, judge."""
+    """Measure the times, print them, and compare them with the limit."""
     repetitions = int(sys.argv[1]) if len(sys.argv) > 1 else 15
     medians = measure(repetitions)
     for name, value in medians.items():

@@ -1,7 +1,7 @@
-"""A model with its delay from one start, against nonlinear least squares over other tools' simulations.
+"""Fit of a model with its delay from one start, against nonlinear least squares with other tools' simulations.
 
-All start at the same delay and coefficients, fit the same samples, and report the cost of what they found, computed
-by the same exact simulation.
+All start at the same delay and coefficients, fit the same samples, and report the cost of their result, computed by the
+same exact simulation.
 """
 
 from _timing import cpu, least
@@ -23,7 +23,7 @@ SYSTEM = TransferFunction([2], [0.25, 0.7, 1], 8.0)
 BOUNDS = (0.0, 15.0)
 START = 7.5
 TARGET = 50
-#: Step of the other tools' simulation where the record has none of its own [s].
+#: Step of the other tools' simulation if the clock of the record is irregular [s].
 FINE_STEP = 0.01
 
 
@@ -45,7 +45,7 @@ def with_control(numerator, denominator, t, u):
 
 
 class LeastSquares:
-    """What a user of a general simulator writes: residuals as a function of coefficients and delay."""
+    """Typical use of a general simulator: residuals as a function of coefficients and delay."""
 
     def __init__(self, record, simulator):
         self.record, self.simulator = record, simulator

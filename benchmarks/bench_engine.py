@@ -1,13 +1,13 @@
-"""What the engine costs on top of the estimates, in wall time, since what is measured is waiting.
+"""Overhead of the engine on top of the estimates, in wall time, since it consists of waiting.
 
     PYTHONPATH=. python benchmarks/bench_engine.py [DATA_SETS [JOBS...]]
 
 Every data set takes 50 ms. The ideal is their sum divided by the number of jobs. The measured time is that of the whole
-command with the workers that are there: looking at the folder, journal with full synchronisation, writing runs.h5 and
-reading back. The start of the workers, paid once however long the run, is shown apart.
+command with workers that are already running: checking the folder, journal with full synchronisation, writing runs.h5
+and reading it. The start of the workers, which does not depend on the length of the run, is reported separately.
 
-Two ways to spend 50 ms are measured. Asleep, a worker leaves the processor free, so that only waiting for the engine
-shows. Busy, the engine and whatever else runs on the machine compete with the workers for processors.
+Two ways to spend 50 ms are measured. A sleeping worker leaves the processor free, so that only the waiting for the
+engine shows. With busy ones, the engine and other processes compete with the workers for processors.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TARGET, SPEED_UP = 0.05, 0.95
 
 
 def measure(data_sets: int, jobs: int, busy: bool, folder: Path) -> float:
-    """Duration of the whole run [s]."""
+    """Return the duration of the whole run [s]."""
     plan = toy_plan(Toy(seconds=TASK, busy=busy, order=3), runs=data_sets, levels=(5.0,))
     # One estimate per data set, so that a data set takes TASK.
     plan = replace(plan, starts=plan.starts[:1])
@@ -57,7 +57,7 @@ def main() -> None:
             for jobs in all_jobs:
                 ideal = data_sets * TASK / jobs
                 name = f"{busy}-{jobs}"
-                # A run this short is all start; the second one has the workers that are there.
+                # A run this short consists of its start; the second one has running workers.
                 get_reusable_executor().shutdown()
                 started = measure(jobs, jobs, busy, Path(scratch) / f"{name}-started")
                 there = measure(jobs, jobs, busy, Path(scratch) / f"{name}-short")

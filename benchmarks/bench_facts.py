@@ -20,14 +20,14 @@ from ctid_cli.inference.record_tests import LEVEL
 from ctid_cli.inference.signal_features import saturated
 from ctid_cli.signals.held import regular_interval
 
-#: Clean records, seed, and how many of them there are for each that is given faults.
+#: Number of clean records, seed, and number of them for each record that gets faults.
 DEFAULTS = ["400", "2026", "4"]
 INPUTS = ("prbs", "step", "multisine")
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A simulated record without noise, and what is true of it."""
+    """A simulated record without noise, and its true properties."""
 
     t: np.ndarray
     u: np.ndarray
@@ -93,13 +93,13 @@ def draw_input(rng, kind, t, slowest):
 
 
 def draw_noise(rng, n, pole):
-    """AR(1) noise of deviation 1, after its transient."""
+    """Return AR(1) noise of deviation 1, after its transient."""
     e = np.sqrt(1 - pole**2) * rng.standard_normal(n + 500)
     return lfilter([1.0], [1.0, -pole], e)[500:]
 
 
 def in_loop(case, noise):
-    """Close a loop u = r - K y with loop gain .5 about a system on a regular clock; None where there is no gain."""
+    """Close a loop u = r - K y with loop gain .5 about a system on a regular clock; None if it has no gain."""
     if case.integrators or regular_interval(case.t) is None:
         return None
     gain = 0.5 / abs(case.system.numerator[-1] / case.system.denominator[-1])
@@ -113,7 +113,7 @@ def in_loop(case, noise):
 
 
 def faulty(case, noise, rng):
-    """The record of a case with each fault."""
+    """Return the record of a case with each fault."""
     n, deviation = case.t.size, noise_deviation(case)
     clean = record_of(case, noise)
     where = rng.choice(np.arange(5, n - 5), 5, replace=False)
@@ -138,12 +138,12 @@ def with_output(record, y):
 
 
 def noise_deviation(case):
-    """Deviation of the noise; that of the response is 1."""
+    """Return the deviation of the noise; that of the response is 1."""
     return 10 ** (-case.snr_db / 20)
 
 
 def alarms(record, beside):
-    """Names of the faults that are stated."""
+    """Return the names of the reported faults."""
     terms = {name for name in ("offset", "drift", "start") if getattr(beside, name).detected}
     others = {
         "outliers": bool(beside.outliers),
@@ -154,14 +154,14 @@ def alarms(record, beside):
 
 
 def true_response_time(case):
-    """Time until 63 % of the final value of the step response."""
+    """Return the time until 63 % of the final value of the step response."""
     t = np.linspace(0, 5 * case.t[-1], 400_001)
     x = simulate(case.system, HeldSignal([0.0], [1.0]), t)
     return float(t[np.argmax(x / x[-1] >= 1 - np.exp(-1))])
 
 
 def held(estimate, truth):
-    """Whether an interval holds a value; None where no interval is given."""
+    """Return whether an interval contains a value; None if there is no interval."""
     return None if np.isnan(estimate.value) else bool(estimate.low - 1e-9 <= truth <= estimate.high + 1e-9)
 
 

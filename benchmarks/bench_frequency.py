@@ -1,4 +1,4 @@
-"""Samples per second of the frequency estimators: whole records, one sample at a time, and plain numpy beside them."""
+"""Samples per second of the frequency estimators: whole records, single samples, and plain numpy for comparison."""
 
 from _timing import cpu, least
 
@@ -35,7 +35,7 @@ def estimators(n):
 
 
 def numpy_finite_time(y, n, h, d, gain):
-    """The finite-time recursion for n tones, sample by sample with numpy, frequencies included."""
+    """Compute the finite-time recursion for n tones, sample by sample with numpy, including frequencies."""
     table, lag, spacing = delay_table(n), round(h / INTERVAL), round(d / INTERVAL)
     lags, stack = lag * np.arange(2 * n + 1), spacing * np.arange(1, n + 1)
     rows = np.full((y.size, n + 1), np.nan)

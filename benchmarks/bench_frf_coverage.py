@@ -1,12 +1,12 @@
-"""How often the 95 % intervals of a frequency response without a model hold the truth, on short records.
+"""Coverage of the 95 % intervals of a frequency response without a model, on short records.
 
 Each record is of a random system of one family (overdamped of second order; resonant with damping .1; both with and
 without a delay; two modes with damping .05, the slower with five to ten periods in 500 samples), sampled every 0.1 s,
 with one input, record length, signal-to-noise ratio, and colour of the noise. Half of the records begin at rest, the
-others in the middle of an experiment. Two truths are told apart: what samples of a held input show, images included
-(which is what the estimates tend to), and the response of the system in continuous time ("system"). Counted are the
-frequencies at which an interval is given, first those with a gain above a tenth of the greatest, then all, then that
-of the greatest gain alone ("top").
+others in the middle of an experiment. Coverage is given for two truths: the response between samples of a held input,
+images included (to which the estimates converge), and the response of the system in continuous time ("system"). Counts
+are over the frequencies with an interval: first those with a gain above a tenth of the greatest, then all, then that of
+the greatest gain alone ("top").
 
     python benchmarks/bench_frf_coverage.py --records 24 --seed 1
 """
@@ -28,22 +28,22 @@ INTERVAL = 0.1
 INPUTS = ("prbs", "prbs periods", "multisine", "multisine periods", "gaussian", "binary")
 SYSTEMS = ("overdamped", "overdamped, delay", "resonant", "resonant, delay", "slow modes")
 LENGTHS, RATIOS, COLOURS = (400, 500, 1000), (10.0, 15.0, 20.0), (0.0, 0.8)
-#: The band of a response: where its gain is more than this share of its greatest.
+#: Least gain within the band of a response, as a share of its greatest.
 IN_BAND = 0.1
 #: Samples before a record that begins in the middle of an experiment.
 BEFORE = 600
-#: Stages and feedback taps of shift registers of greatest length.
+#: Stages and feedback taps of maximum-length shift registers.
 TAPS = {7: (7, 6), 11: (11, 9)}
 
 
 class Counts(NamedTuple):
-    """What is counted of one record."""
+    """Counts of one record."""
 
     #: Hits and trials inside the band of the response, then over all frequencies: intervals and phases drawn, gain,
     #: phase and complex value covered, complex value of the system covered; then interval drawn and complex value
     #: covered at the greatest gain, shape (14, 2).
     counts: np.ndarray
-    #: Radii over the gain, and over the error, of the intervals drawn inside the band.
+    #: Radii of the drawn intervals inside the band over the gain, and over the error.
     widths: np.ndarray
     ratios: np.ndarray
     method: str
@@ -81,7 +81,7 @@ def multisine(period, count, rng):
 
 
 def make_input(kind, n, count, rng):
-    """Input of a record of n samples, count of them with those before it."""
+    """Return the input of a record of n samples; count includes those before it."""
     if kind == "prbs":
         return shift_register(11, count, int(rng.integers(1, 4)), rng)
     if kind == "prbs periods":
@@ -110,7 +110,7 @@ def make_record(kind, family, n, ratio, colour, rng):
 
 
 def sampled_response(model, w):
-    """Spectrum of the answer to one held sample, over that of the hold."""
+    """Return the spectrum of the response to one held sample, over that of the hold."""
     count = round(120.0 / INTERVAL)
     t = INTERVAL * np.arange(count)
     pulse = np.zeros(count)

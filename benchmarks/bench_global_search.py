@@ -1,13 +1,13 @@
-"""The global searches for a delay against each other and against multi-start least squares, on the study's data sets.
+"""Global searches for a delay compared with each other and with multi-start least squares, on the study's data sets.
 
-Case 1 and case 2 of the useful-redundancy study, 15 dB, every data set a fresh record: checking, filtering, search and
-refinement are counted. `useful_redundancy` starts from 0 s. The baseline, where the clock is regular, is
+Case 1 and case 2 of the useful-redundancy study, 15 dB, every data set a new record: times include checks, filtering,
+search and refinement. `useful_redundancy` starts from 0 s. The baseline, for a regular clock, is
 ``scipy.optimize.least_squares`` from equally spaced delays, with an exact difference equation as its simulation and the
 coefficients of the SVF estimate as start (see bench_measured.py).
 
-The baseline has the fewest starts that find the delay (within 1 %) in 99 % of data sets. On each data set the interval
-of starts around the true delay from which one run finds it is bracketed; starts ``spacing`` apart, of which nobody
-knows where they lie beside the true delay, then meet it with the probability ``min(1, width / spacing)``.
+The baseline has the least number of starts that find the delay (within 1 %) in 99 % of data sets. On each data set the
+interval of starts around the true delay from which one run finds it is bracketed; starts ``spacing`` apart, at random
+positions relative to the true delay, then hit it with the probability ``min(1, width / spacing)``.
 
     python benchmarks/bench_global_search.py [DATA_SETS]
 """
@@ -28,19 +28,19 @@ CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "useful_redundancy"
 METHODS = ("delay_profile", "redundancy")
 TRUTH, BOUNDS = 8.0, (0.0, 15.0)
 WANTED = 0.99
-#: Width of an interval of starts is looked for up to these distances [s], to this fraction of itself.
+#: Largest widths of an interval of starts that are searched [s], and their tolerance relative to the width.
 REACH = {"case1": 7.0, "case2": 1.0}
 PRECISION = 0.02
 
 
 def found(record, estimator, delays):
-    """Whether least squares from these delays find the true one."""
+    """Return whether least squares from these delays find the true one."""
     theta = multi_start(record, estimator.poles, BOUNDS, delays, exact_zoh, estimator.zeros)
     return abs(theta[-1] - TRUTH) < 0.01 * TRUTH
 
 
 def width(record, estimator, reach):
-    """Width of the interval of starts around the true delay from which one run finds it [s]."""
+    """Return the width of the interval of starts around the true delay from which one run finds it [s]."""
     total = 0.0
     for side in (-1.0, 1.0):
         low, high = 0.0, reach
@@ -52,7 +52,7 @@ def width(record, estimator, reach):
 
 
 def fewest(widths):
-    """Starts on the range of delays that meet the interval in the wanted share of data sets."""
+    """Return the number of starts on the range of delays that hit the interval in the required share of data sets."""
     count = 1
     while np.mean(np.minimum(1.0, widths * count / (BOUNDS[1] - BOUNDS[0]))) < WANTED:
         count += 1
@@ -87,7 +87,7 @@ def main():
             estimator = estimators["redundancy"]
             widths = np.array([width(record, estimator, REACH[case]) for record in records])
             starts = fewest(widths)
-            # Where the starts lie is drawn anew for every data set; those of the longest runs are few.
+            # The positions of the starts are drawn anew for every data set; those of the longest runs are few.
             rng, spacing = np.random.default_rng(0), (BOUNDS[1] - BOUNDS[0]) / starts
             some = records[: max(2, min(count, 400 // starts))]
             runs = [cpu(found, r, estimator, BOUNDS[0] + spacing * (rng.random() + np.arange(starts))) for r in some]

@@ -1,11 +1,11 @@
-"""Do fits of systems that integrate reach the optimum, and do their intervals hold? Random systems, random starts.
+"""Fits of integrating systems: distance from the optimum, and coverage of intervals. Random systems, random starts.
 
     python benchmarks/bench_integrators.py [--systems 300] [--seed 1] [--starts 200] [--refined 10] [--first 0]
 
 Systems of one integrator and up to three poles (300 to 500 samples, a third of them irregular) have a delay that is
 searched, and an initial state and an offset that are estimated. The least output error of ``DelayProfile`` is compared
 with the least that ``scipy.optimize.least_squares`` reaches in the same box from the best of many random starts; the
-peer shares no line with ctid. Intervals of 95 % are asked whether they hold the parameters that the system has.
+peer shares no code with ctid. The coverage of the true parameters by 95 % intervals is counted.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from ctid_cli import DataError, DelayProfile, HeldSignal, Record
 
 
 def random_case(rng):
-    """A record, the true parameters by name, and the options that belong to it."""
+    """Return a record, the true parameters by name, and the options for it."""
     n, samples, h = int(rng.integers(0, 4)), int(rng.integers(300, 501)), 10.0 ** rng.uniform(-2, 0)
     poles = random_poles(rng, n, 15 / (samples * h), 0.6 / h, 0.1)
     m = int(rng.integers(0, n + 1))
@@ -49,7 +49,7 @@ def random_case(rng):
 
 
 def compared(number, asked):
-    """Status, the peer's squared error over ctid's less one, which intervals hold, time, and what to say."""
+    """Return status, the peer's squared error over ctid's less one, intervals that cover, time, and remarks."""
     rng = np.random.default_rng([asked.seed, number])
     record, truth, poles, options = random_case(rng)
     spent, fit = cpu(options.fit, record)
@@ -67,7 +67,7 @@ def compared(number, asked):
     held = []
     for name, value in truth.items():
         error = fit.standard_errors[name]
-        # Poles that ran to infinity, or were held, leave parameters without an interval.
+        # Parameters of poles at infinity, or at a bound, have no interval.
         if name in fit.parameters and error > 0 and fit.status.name == "CONVERGED":
             held.append(abs(fit.parameters[name] - value) <= reach[name] * error)
     clock = "regular" if record.interval else "irregular"

@@ -19,7 +19,7 @@ SYSTEMS = {
     "second": TransferFunction([4], [1, 0.8, 4], delay=0.53),
     "third": TransferFunction([6], [1, 4.2, 7.4, 6], delay=0.9),
 }
-#: Correlation of the noise at one mean interval.
+#: Correlation of the noise over one mean interval.
 COLOURS = (0.5, 0.9, 0.98)
 
 
@@ -40,7 +40,7 @@ def drive(kind, end, rng):
 
 
 def sensitivities(system, signal, t):
-    """Return the derivatives of the output by coefficients and delay, by central differences."""
+    """Return the derivatives of the output with respect to coefficients and delay, by central differences."""
     order = len(system.denominator) - 1
     theta = np.concatenate([system.denominator[1:], system.numerator, [system.delay]])
 

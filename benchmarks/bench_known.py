@@ -1,4 +1,4 @@
-"""Do fits with known coefficients reach the optimum? Random systems against SLSQP from 200 random starts.
+"""Fits with known coefficients: distance from the optimum. Random systems against SLSQP from 200 random starts.
 
     python benchmarks/bench_known.py [--systems 300] [--seed 1] [--starts 200] [--refined 30] [--all-refined 30]
 
@@ -7,7 +7,7 @@ delay) have one or two coefficients fixed, at their true values or off by 20 %. 
 ``DelayProfile(nested=True, fixed=...)``, and of the same fit with nothing fixed, is compared with the least that
 ``scipy.optimize.minimize(method="SLSQP")`` reaches in the same box of admissible poles and delays: from random starts
 moved onto the constraint (the best of them are refined, all of them for every tenth system), from the free optimum
-moved there, and from the true poles. The peer shares no line with ctid: responses are sums over poles, gradients exact,
+moved there, and from the true poles. The peer shares no code with ctid: responses are sums over poles, gradients exact,
 numerator, free response and offset are eliminated by dense least squares. A line is printed for each fit above the peer
 by more than a millionth, and a summary at the end.
 """
@@ -26,7 +26,7 @@ from scipy.optimize import minimize
 from ctid_cli import DataError, DelayProfile, Fixed, HeldSignal, Record, TransferFunction
 
 TOLERANCE = 1e-6
-#: Largest error in ln(a_i) of a peer's model that counts as one with the known coefficients.
+#: Largest error in ln(a_i) of a peer's model that counts as having the known coefficients.
 FEASIBLE = 1e-12
 
 
@@ -35,7 +35,7 @@ FEASIBLE = 1e-12
 
 @njit(cache=True)
 def modal_slopes(poles, tu, u, t, delay, delayed):
-    """Responses of 1/(s - p) to a held input from rest, and their derivatives to p and to the delay."""
+    """Return the responses of 1/(s - p) to a held input from rest, and their derivatives to p and to the delay."""
     out = np.zeros((3, t.size, poles.size), np.complex128)
     edges = tu + delay
     for k in range(poles.size):
@@ -62,7 +62,7 @@ def modal_slopes(poles, tu, u, t, delay, delayed):
 
 
 class Peer:
-    """Squared error and its gradient over poles and delay, everything linear eliminated."""
+    """Squared error and its gradient over poles and delay, with all linear parameters eliminated."""
 
     def __init__(self, record, options, box, fixed):
         self.record, self.options, self.box = record, options, box
@@ -76,7 +76,7 @@ class Peer:
         self.evaluations = 0
 
     def value(self, poles, delay, slopes=True):
-        """Squared error, its derivatives to the poles (complex) and to the delay."""
+        """Return the squared error, its derivatives to the poles (complex) and to the delay."""
         self.evaluations += 1
         t, u = self.record.t, self.record.input
         v, dv, rate = (part[self.use] for part in modal_slopes(poles, u.t, u.values, t, delay, slopes))
@@ -111,7 +111,7 @@ class Peer:
         b[free_b] = solution[: len(free_b)]
         for k, coefficient in self.known_b.items():
             b[k] = coefficient
-        # Of sum_k R_k v_k with R_k = B(p_k)/prod(p_k - p_l), at a fixed B.
+        # Derivatives of sum_k R_k v_k with R_k = B(p_k)/prod(p_k - p_l), at a fixed B.
         gradient = np.zeros(self.n, complex)
         parts = [(b, np.polyval(b, poles), np.polyval(np.polyder(b), poles), v, dv)]
         if estimated:
@@ -125,12 +125,12 @@ class Peer:
             along, moving = residual @ response, residual @ changed
             own_slope = slope * weights - residue * inverse.sum(axis=1)
             gradient += residue * moving + own_slope * along + (residue * along) @ inverse
-        # At relative degree one x' holds b0 u, which jumps with u: between the jumps this is its derivative.
+        # At relative degree one x' contains b0 u, which jumps with u: between the jumps this is its derivative.
         shift = residual @ (rate @ (np.polyval(b, poles) * weights)).real
         return float(residual @ residual), -2.0 * gradient, -2.0 * float(shift)
 
     def roots_of(self, x, pairs):
-        """Poles from ln w and ln zeta of the pairs and ln p of the others, and their derivatives."""
+        """Return the poles from ln w and ln zeta of the pairs and ln p of the others, and their derivatives."""
         n = self.n
         w, zeta, reals = np.exp(x[:pairs]), np.exp(x[pairs : 2 * pairs]), np.exp(x[2 * pairs : n])
         swing = np.sqrt(np.maximum(1.0 - zeta**2, 1e-12))
@@ -146,7 +146,7 @@ class Peer:
         return poles, slopes
 
     def constraint(self, x, pairs):
-        """ln(a_i/v_i) of the known a_i, and its derivatives."""
+        """Return ln(a_i/v_i) of the known a_i, and its derivatives."""
         places = sorted(self.known_a)
         values = np.array([self.known_a[place] for place in places])
         poles, slopes = self.roots_of(x, pairs)
@@ -167,7 +167,7 @@ class Peer:
         return np.array(low), np.array(high)
 
     def moved(self, x, pairs):
-        """The point moved onto the constraint within the limits by Newton's steps; None where they fail."""
+        """Return the point moved onto the constraint within the limits by Newton's steps; None if they fail."""
         low, high = self.limits(pairs)
         x = np.clip(x, low, high)
         if not self.known_a:
@@ -186,7 +186,7 @@ class Peer:
         return float(x[-1]) * self.box.quarter if self.free_delay else self.options.delay_bounds[0]
 
     def objective(self, x, pairs):
-        """ln of the squared error, and its gradient."""
+        """Return ln of the squared error, and its gradient."""
         poles, slopes = self.roots_of(x, pairs)
         squared, to_poles, to_delay = self.value(poles, self.delay(x))
         if not np.isfinite(squared):
@@ -198,7 +198,7 @@ class Peer:
         return np.log(squared), gradient / squared
 
     def polished(self, x, pairs):
-        """Least squared error from a point, by SLSQP."""
+        """Return the least squared error from a point, by SLSQP."""
         low, high = self.limits(pairs)
         conditions = []
         if self.known_a:
@@ -230,7 +230,7 @@ class Peer:
         return best
 
     def below_nyquist(self, x, pairs):
-        """ln of the greatest imaginary part over that of each pair."""
+        """Return ln of the greatest imaginary part over that of each pair."""
         w, zeta = x[:pairs], np.exp(x[pairs : 2 * pairs])
         return np.log(self.box.imaginary) - w - 0.5 * np.log(np.maximum(1.0 - zeta**2, 1e-12))
 
@@ -238,7 +238,7 @@ class Peer:
         return self.value(self.roots_of(x, pairs)[0], self.delay(x), False)[0]
 
     def coordinates(self, poles, delay):
-        # Poles that have run to infinity stand at the edge of the box.
+        # Poles at infinity are moved to the edge of the box.
         poles = np.append(poles, np.full(self.n - poles.size, -self.box.fastest))
         pairs, reals = poles[poles.imag > 0], -poles[poles.imag == 0].real
         x = [np.log(np.abs(pairs)), np.log(-pairs.real / np.abs(pairs)), np.log(reals)]
@@ -256,7 +256,7 @@ class Peer:
 
 
 def random_case(rng):
-    """A record, its true model, options without known coefficients, and these."""
+    """Return a record, its true model, options without known coefficients, and with them."""
     n = int(rng.integers(1, 5))
     samples, h = int(rng.integers(300, 601)), 10.0 ** rng.uniform(-2, 0)
     initial_state = str(rng.choice(["rest", "estimate"]))
@@ -301,7 +301,7 @@ def random_case(rng):
 
 
 def reached(peer, rng, starts, refined, own):
-    """Least squared errors of the peer by where it started."""
+    """Return the least squared errors of the peer by its start."""
     trials = []
     for _ in range(starts):
         x, pairs = peer.random(rng)
@@ -318,7 +318,7 @@ def reached(peer, rng, starts, refined, own):
 
 
 def compared(number, asked):
-    """Lines of one system, free and with known coefficients: statuses and the peer's squared error over ctid's."""
+    """Return the lines of one system, free and with known coefficients: statuses and the peer's error over ctid's."""
     rng = np.random.default_rng([asked.seed, number])
     record, truth, options, fixed, right = random_case(rng)
     refined = asked.starts if number % 10 == 0 and number // 10 < asked.all_refined else asked.refined

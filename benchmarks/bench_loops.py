@@ -1,21 +1,22 @@
-"""Are plants found in their loops, unstable ones too, and do the errors hold? Simulated records, controller known.
+"""Plants in closed loops, also unstable ones: convergence and errors. Simulated records, known controller.
 
     python benchmarks/bench_loops.py [--runs 17] [--seed 1] [--samples 4000] [--paper 60] [--unknown 60]
     python benchmarks/bench_loops.py --known controller [--records 300] [--length 600] [--snr-db 15] [--seed 1]
 
 With ``--known`` the plant ``4 exp(-.537 s)/(s^2 + 2.8 s + 4)``, sampled every .1 s in a loop with a PI controller, by
-what is known: ``controller`` and reference (the delay searched in 0 to 2 s, white noise), the ``reference`` (the delay
-told), or ``nothing`` (the direct method, the delay searched, noise (1 + .5 q^-1)/(1 - 1.5 q^-1 + .7 q^-2) e, which
-``--noise-model`` estimates: right, chosen, or too small). Errors are in standard deviations by theory, from the
-sensitivities at the truth with the record's own signals. Each record is printed to stderr when it is done.
+the known part of the loop: ``controller`` and reference (the delay searched in 0 to 2 s, white noise), the
+``reference`` (the delay known), or ``nothing`` (the direct method, the delay searched, noise (1 + .5 q^-1)/(1 - 1.5
+q^-1 + .7 q^-2) e, which ``--noise-model`` estimates: true, chosen, or too small orders). Errors are in standard
+deviations by theory, from the sensitivities at the truth with the record's own signals. Each record is printed to
+stderr when it is done.
 
 Without it, first 4/(p^2 - 1) in six loops with PD controllers kp (1 + td (1 - q^-1)/h), at two levels of white output
-noise: ``runs`` records of each of the twelve, by ``LoopOutputError``: how many end CONVERGED with errors, how many of
-their intervals hold the truth, and how many others have an error. Then two modes in the loop of section 6.2 of A.
+noise: ``runs`` records of each of the twelve, by ``LoopOutputError``: the number that end CONVERGED with errors, the
+coverage of their intervals, and the number of others with an error. Then two modes in the loop of section 6.2 of A.
 González et al., *Identification of additive continuous-time systems in open and closed loop*, Automatica (2025),
 arXiv:2401.01263, with a delay of .12 s that is searched in 0 to .5 s: errors of the delay and of the modes'
-frequencies, beside CLSRIVC that is told the delay. Last the same loop with noise e/(1 - .9 q^-1) of the same variance,
-by what is known of the loop: reference and controller, the reference alone, or nothing (the direct method).
+frequencies, compared with CLSRIVC with the known delay. Last the same loop with noise e/(1 - .9 q^-1) of the same
+variance, by the known part of the loop: reference and controller, the reference alone, or nothing (the direct method).
 """
 
 import argparse
@@ -54,7 +55,7 @@ LOOPS += ((0.02, 1, 0.5, 10),)
 UNSTABLE = TransferFunction([4.0], [1.0, 0.0, -1.0])
 MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])], 0.12)
 PID, INTERVAL = DiscreteController([0.02329, -0.02058, 0.00454], [1.0, -1.0, 0.0]), 0.05
-#: The loop of campaigns: plant, its parameters, controller and sampling interval; C and D of the coloured noise.
+#: Loop of the campaigns: plant, its parameters, controller and sampling interval; C and D of the coloured noise.
 LATE, DELAYS = TransferFunction([4.0], [1.0, 2.8, 4.0], 0.537), (0.0, 2.0)
 TRUE = np.array([2.8, 4.0, 4.0, 0.537])
 PI, STEP, HELD = DiscreteController([0.5, -0.47], [1.0, -1.0]), 0.1, 5
@@ -105,7 +106,7 @@ def six_loops(runs, samples, seed):
 
 
 def frequencies(model):
-    """Natural frequencies of the two pairs, or NaN where there are not two."""
+    """Return the natural frequencies of the two pairs, or NaN if there are not two."""
     upper = np.sort(np.abs([pole for pole in model.poles if pole.imag > 0]))
     return upper if upper.size == 2 else np.full(2, np.nan)
 
@@ -152,10 +153,10 @@ def paper_loop(runs, seed, coloured):
 
 
 def theory_with_controller(record, variance, v):
-    """Covariance of ``y - T r`` as the criterion: the noise goes through the loop, ``S v``."""
+    """Return the covariance for the criterion ``y - T r``: the noise passes through the loop, ``S v``."""
     problem = LoopOutputError(2, 0, DELAYS).prepare(record).laid_out.problem
     psi = problem.response.rows(TRUE, TRUE.size, problem.cell_of(TRUE[-1])).slopes * problem.data.use[:, None]
-    # The transposed loop runs backwards.
+    # The transposed loop runs backwards in time.
     still = np.zeros(len(psi))
     back = [(simulate_loop(LATE, PI, still, column, STEP).x + column)[::-1] for column in psi[::-1].T]
     inverse = np.linalg.inv(psi.T @ psi)
@@ -163,7 +164,7 @@ def theory_with_controller(record, variance, v):
 
 
 def theory_with_reference(record, variance, v):
-    """Covariance of instrumental variables made of what of the input follows the reference."""
+    """Return the covariance of instrumental variables made of the part of the input that follows the reference."""
     followed = following(record.loop.reference, record.input.values)
     psi, instruments = (
         sensitivities(LATE, HeldSignal(record.t, u), record.t)[record.t >= LATE.delay]
@@ -174,7 +175,7 @@ def theory_with_reference(record, variance, v):
 
 
 def theory_of_the_direct_method(record, variance, v):
-    """Cramér-Rao bound of the plant beside unknown coefficients of the noise: in a loop they are not independent."""
+    """Return the plant's Cramér-Rao bound with unknown noise coefficients, which in a loop are not independent."""
     used, free = record.t >= DELAYS[1], np.array([*COLOURED[0][1:], *COLOURED[1][1:]])
     split, steps = len(COLOURED[0]) - 1, steps_of(used)
 
@@ -190,7 +191,7 @@ def theory_of_the_direct_method(record, variance, v):
 
 
 def campaign(given):
-    """Print the table of one kind of knowledge."""
+    """Print the table of one known part of the loop."""
     coloured, names = given.known == "nothing", ("a1", "a2", "b0", "delay")[: 3 if given.known == "reference" else 4]
     truth = dict(zip(names, TRUE, strict=False))
     estimator, theory = {

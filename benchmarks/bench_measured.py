@@ -1,6 +1,6 @@
-"""The delay found without a start, against least squares started from many delays.
+"""Search for the delay without a start, compared with least squares started from many delays.
 
-Without arguments on simulated records, otherwise on regularly sampled CSV files with columns t, u, y:
+Without arguments it uses simulated records, otherwise regularly sampled CSV files with columns t, u, y:
 
 python benchmarks/bench_measured.py record.csv --delay 0:2 --poles 1 2
 python benchmarks/bench_measured.py record.csv --delay 0:1 --samples 500 --centre
@@ -26,12 +26,12 @@ from ctid_cli.signals.record import Record
 TARGET = 10
 #: Largest relative excess of our cost.
 EXCESS = 1e-6
-#: Repetitions of ours; the baseline is slow enough to be timed once.
+#: Repetitions of our fit; the baseline is slow enough for one.
 REPEATS = 7
 
 
 def exact_zoh(a, b, delay, interval, u):
-    """Exact response to the held input at the sampling instants: a difference equation for the delayed output."""
+    """Return the exact response to the held input at the samples: a difference equation for the delayed output."""
     dynamics, gain, output, _ = signal.tf2ss(b, a)
     shift = int(np.ceil(delay / interval))
     inside = shift * interval - delay
@@ -46,7 +46,7 @@ def exact_zoh(a, b, delay, interval, u):
 
 
 def with_lsim(a, b, delay, interval, u):
-    """What is mostly written: the mean of the delayed input over each interval into ``scipy.signal.lsim``."""
+    """Return the usual simulation: the mean of the delayed input over each interval into ``scipy.signal.lsim``."""
     t = interval * np.arange(u.size)
     edges = interval * np.arange(u.size + 1)
     integral = np.concatenate(([0.0], np.cumsum(u) * interval))
@@ -58,7 +58,7 @@ SIMULATIONS = {"exact": exact_zoh, "scipy.signal.lsim": with_lsim}
 
 
 def multi_start(record, poles, bounds, delays, simulation, zeros=0):
-    """Coefficients and delay of the lowest cost over starts at some delays."""
+    """Return coefficients and delay of the lowest cost over starts at some delays."""
     u, interval = record.input.values, record.interval
 
     def residuals(theta):

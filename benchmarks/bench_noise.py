@@ -1,15 +1,15 @@
-"""Plant and noise by maximum likelihood, on simulated records, against the Cramér-Rao bound.
+"""Plant and noise by maximum likelihood, on simulated records, compared with the Cramér-Rao bound.
 
     python benchmarks/bench_noise.py [--records 500] [--samples 600] [--snr-db 15] [--noise slow] [--orders true|auto]
         [--held 5] [--seed 1]
 
 The plant is ``4 exp(-.537 s)/(s^2 + 2.8 s + 4)``, sampled every .1 s, under steps of random sign of some samples; its
-delay is searched from 0 to 2 s and lies off the samples. The noise is ``C(q)/D(q) e`` of one of the pairs in NOISES.
-Errors count in standard deviations by the bound of each record, with its input and the true noise. For each parameter:
+delay is searched from 0 to 2 s and lies between samples. The noise is ``C(q)/D(q) e`` of one of the pairs in NOISES.
+Errors are in standard deviations by the bound of each record, with its input and the true noise. For each parameter:
 
 bias           mean error, and its Monte Carlo error
 scatter        standard deviation of the errors
-rmse           root mean square error, that of the output-error fit beside it
+rmse           root mean square error, and that of the output-error fit
 coverage       of 95 % intervals [%]
 hausman        rejections at 1 % [%]; orders: how often each pair was estimated
 
@@ -37,7 +37,7 @@ NOISES = {"slow": ((1.0, 0.2679), (1.0, -1.98, 0.9802)), "fast": ((1.0, 0.9), (1
 
 
 def simulated(pair, samples, held, snr_db, seed, replicate):
-    """A record, and the standard deviations of the bound."""
+    """Return a record, and the standard deviations of the bound."""
     t = INTERVAL * np.arange(samples)
     levels = stream(seed, "input", replicate).choice([-1.0, 1.0], samples // held + 1)
     signal = HeldSignal(t, np.repeat(levels, held)[:samples])

@@ -1,19 +1,19 @@
-"""Is the estimate the optimum? Random systems against an optimiser that shares no line with ctid, in the same box.
+"""Distance of estimates from the optimum: random systems against an independent optimiser in the same box.
 
     python benchmarks/bench_optimum.py [--systems 100] [--seed 1] [--starts 3] [--likes] [--records FOLDER]
     python benchmarks/bench_optimum.py --two-inputs 300 --starts 200
 
 For each system the least output error of ``DelayProfile(nested=True)`` is compared with what ``scipy.optimize`` reaches
 from the true poles, from random ones, and from ctid's own estimate: variable projection on columns of modal responses,
-Jacobians by differences. The peer knows the truth and ctid does not. A line is printed for each system where ctid is
-above the peer by more than a millionth, and a summary at the end.
+Jacobians by differences. The peer knows the truth and ctid does not. A line is printed for each system with ctid above
+the peer by more than a millionth, and a summary at the end.
 
 ``--likes`` adds two kinds of systems at the border of the admissible models, a lightly damped mode in a periodic record
-and an integrating drive at rest: there the cost is compared with that in a set without such bounds too. ``--records``
-adds measured records, CSV files with columns t, u and y that YAML files beside them name, with four structures each.
+and an integrating drive at rest: their cost is also compared with that in a set without such bounds. ``--records`` adds
+measured records, CSV files with columns t, u and y named in YAML files next to them, with four structures each.
 
 ``--two-inputs`` has systems with two inputs, each of order 1 or 2 with a delay of 0 to 20 samples, PRBS, 15 dB, both
-delays searched. Their peer are descents of ctid's own from random poles and delays in the same box, and from the truth.
+delays searched. The peer consists of ctid's descents from random poles and delays in the same box, and from the truth.
 """
 
 import argparse
@@ -36,7 +36,7 @@ from ctid_cli.signals.measurement import read_measurement
 TOLERANCE = 1e-6
 #: Poles whose distances, as fractions of their magnitudes, have a smaller product are left out by the peer.
 CLOSE = 3e-4
-#: Slowest pole times the record's length, and least damping, of a set that bounds nothing that matters.
+#: Slowest pole times the record's length, and least damping, of a set without effective bounds.
 NEARLY_ZERO = 1e-6
 #: Poles and zeros tried on measured records, most of their samples, and the treatment of each: state, offset, delays.
 STRUCTURES, MOST = ((1, 0), (2, 1), (3, 2), (4, 3)), 4000
@@ -58,7 +58,7 @@ TREATMENTS = {
 
 @njit(cache=True)
 def grown(p, length):
-    """(exp(p t) - 1)/p, also of poles at the origin."""
+    """Return (exp(p t) - 1)/p, also for poles at the origin."""
     z = p * length
     if abs(z) < 1e-3:
         return length * (1 + z / 2 * (1 + z / 3 * (1 + z / 4 * (1 + z / 5))))
@@ -67,14 +67,14 @@ def grown(p, length):
 
 @njit(cache=True)
 def modal_responses(poles, tu, u, t, delay, period):
-    """Responses of 1/(s - p) to a held input at the samples, at rest before or repeating for ever."""
+    """Return the responses of 1/(s - p) to a held input at the samples, at rest before or periodic."""
     out = np.empty((t.size, poles.size), np.complex128)
     edges = tu + delay
     for k in range(poles.size):
         p, v = poles[k], 0.0 + 0.0j
         for lap in range(2 if period > 0 else 1):
             if period > 0:
-                # Up to the first sample, what the end of the last period has left is still held.
+                # Up to the first sample, the last input of the previous period is still held.
                 begin = t[0]
                 j = -1
                 shift = 0.0
@@ -114,7 +114,7 @@ def modal_responses(poles, tu, u, t, delay, period):
 
 
 class Peer:
-    """Squared error over poles and delay, everything linear eliminated."""
+    """Squared error over poles and delay, with all linear parameters eliminated."""
 
     def __init__(self, record, options, box):
         self.record, self.options, self.box = record, options, box
@@ -145,12 +145,12 @@ class Peer:
         apart = np.abs(poles[:, None] - poles) / (np.abs(poles[:, None]) + np.abs(poles) + 1e-300)
         np.fill_diagonal(apart, 1.0)
         if not np.isfinite(phi).all() or apart.prod(axis=1).min() < CLOSE:
-            # Poles that coincide have no modal responses of their own, and those of close ones are rounding.
+            # Coinciding poles have no separate modal responses, and those of close ones are rounding.
             return y
         return y - phi @ np.linalg.lstsq(phi, y, rcond=1e-13)[0]
 
     def polished(self, poles, delay):
-        """Least squared error from given poles and delay, within the box."""
+        """Return the least squared error from given poles and delay, within the box."""
         pairs, reals = poles[poles.imag > 0], -poles[poles.imag == 0].real
         n, r, box = pairs.size, reals.size, self.box
         frequencies = np.log(np.concatenate((np.abs(pairs), reals)))
@@ -181,7 +181,7 @@ class Peer:
 
 
 def random_case(rng):
-    """A record, its true model, and the options that belong to it."""
+    """Return a record, its true model, and the options for it."""
     n = int(rng.integers(1, 9))
     samples = int(np.exp(rng.uniform(np.log(80), np.log(20000) if rng.random() < 0.15 else np.log(2500))))
     treatment = str(rng.choice(["rest", "estimate", "periodic"], p=[0.5, 0.3, 0.2]))
@@ -241,7 +241,7 @@ def random_poles(rng, n, slowest, fastest, least_damping):
 
 
 def lightly_damped(rng):
-    """A periodic record of a mode with a damping of .0005, one sixth of the samples per radian."""
+    """Return a periodic record of a mode with a damping of .0005, one sixth of the samples per radian."""
     samples, w, zeta = 2000, 0.6, 5e-4
     t, lines = np.arange(float(samples)), np.arange(1, samples // 3)
     angles = 2 * np.pi / samples * np.outer(t, lines) + rng.uniform(0, 2 * np.pi, lines.size)
@@ -250,7 +250,7 @@ def lightly_damped(rng):
 
 
 def integrating(rng):
-    """A drive from rest: an integrator behind a lag of eight samples, under random steps."""
+    """Return a record of a drive from rest: an integrator behind a lag of eight samples, under random steps."""
     u = np.repeat(rng.choice([-1.0, 1.0], 50), 20)
     return finished(rng, u, np.array([-0.125, 0.0], dtype=complex), 40.0, "rest")
 
@@ -264,7 +264,7 @@ def finished(rng, u, poles, snr_db, state):
 
 
 def measured(folder):
-    """Names and records that the YAML files of a folder describe."""
+    """Return names and records that the YAML files of a folder describe."""
     for described in sorted(Path(folder).glob("*.yaml")):
         about = yaml.safe_load(described.read_text())
         if "file" not in about or "u" not in about.get("columns", "tuy"):
@@ -279,14 +279,14 @@ def measured(folder):
 
 
 def reached_from(peer, starts, ours):
-    """The peer's least squared errors over ours, less one, by where it started."""
+    """Return the peer's least squared errors over ours, less one, by start."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return {name: peer.polished(*start) / ours - 1 for name, start in starts.items()}
 
 
 def starts_of(rng, record, options, fit, count):
-    """Ctid's own estimate, and random starts: from what a record shows well, every other one from the whole set."""
+    """Return ctid's own estimate, and random starts, alternately from the well determined and from the whole set."""
     starts, box = {"ctid's own": (fit.model.poles, fit.model.delay)}, fit.box
     for k in range(count):
         slowest, damping = (box.slowest, box.least_damping) if k % 2 else (1.0 / record.duration, 0.01)
@@ -297,7 +297,7 @@ def starts_of(rng, record, options, fit, count):
 
 
 def compared(number, rng, peer_starts):
-    """One system: the status of ctid's estimate, its squared error over the peer's, and what to say of it."""
+    """Return the status of ctid's estimate for one system, its squared error over the peer's, and remarks."""
     record, truth, options = random_case(rng)
     spent, fit = cpu(options.fit, record)
     ours, peer = fit.cost * fit.count, Peer(record, options, fit.box)
@@ -316,7 +316,7 @@ def compared(number, rng, peer_starts):
 
 
 def tabulated(name, record, options, rng, count, truth=None):
-    """A line of the table: one structure on one record."""
+    """Return a line of the table: one structure on one record."""
     spent, fit = cpu(options.fit, record)
     ours, peer = fit.cost * fit.count, Peer(record, options, fit.box)
     reached = reached_from(peer, starts_of(rng, record, options, fit, count), ours)
@@ -324,7 +324,7 @@ def tabulated(name, record, options, rng, count, truth=None):
     text = f"{name:22}{options.poles}/{options.zeros}  {options.initial_state:9}{options.offset:9}"
     text += f"{fit.status.name:15}{fit.cost:14.8g}{-reached[least]:+11.1e} {least:15}{spent:8.2f}"
     if truth is not None:
-        # Bounds that leave the set open where the truth is.
+        # Bounds that do not act near the truth.
         wide = replace(fit.box, slowest=NEARLY_ZERO / record.duration, least_damping=NEARLY_ZERO)
         peer = Peer(record, options, wide)
         text += f"{1 / (1 + reached_from(peer, {'': (truth.poles, truth.delay)}, ours)['']):12.5g}"
@@ -333,7 +333,7 @@ def tabulated(name, record, options, rng, count, truth=None):
 
 
 def two_inputs(rng):
-    """A record with two inputs, and their true models."""
+    """Return a record with two inputs, and their true models."""
     orders, h, samples = rng.integers(1, 3, 2), 0.1, 600
     t, models, inputs = h * np.arange(samples), [], {}
     for k, n in enumerate(orders):
@@ -350,7 +350,7 @@ def two_inputs(rng):
 
 
 def two_inputs_compared(number, rng, count):
-    """CPU time of a fit with two inputs, and how far the least descent and that from the truth are from it."""
+    """Return CPU time of a fit with two inputs, and the differences of the least descent and of that from the truth."""
     record, models = two_inputs(rng)
     own = tuple(InputModel(name, poles=m.order) for name, m in zip(record.held, models, strict=True))
     prepared = DelayProfile(max(m.order for m in models), 0, (0.0, 2.0), inputs=own).prepare(record)

@@ -1,12 +1,12 @@
-"""Partials of recorded notes: those of an independent fit, and how many of them a track keeps.
+"""Partials of recorded notes: those of an independent fit, and the number of them in a track.
 
     python benchmarks/bench_partials.py guitar_E2.csv [more.csv] [--windows 4]
 
 In windows of one second, exponentially growing chirps are fitted by Gauss-Newton steps with dense linear algebra.
-Peaks of what is left join where they are 10 dB above the noise floor, a running median. Of the partials that stand 10
-dB above it in the end, one is kept if a tone of the track has a row within .3 Hz, and valid if that row is: at the
-middle of the window, or anywhere in it. No two valid readings of one row should be within one bin of their windows. A
-window takes up to two minutes.
+Peaks of the residual are added if they are 10 dB above the noise floor, a running median. A partial that is 10 dB above
+it in the end is kept if a tone of the track has a row within .3 Hz, and valid if that row is: at the middle of the
+window, or anywhere in it. No two valid readings of one row should be within one bin of their windows. A window takes up
+to two minutes.
 """
 
 import argparse
@@ -16,8 +16,8 @@ import numpy as np
 from ctid_cli.signals.sampled_signal import read_sampled_signal
 from ctid_cli.tones.track import track
 
-#: Least power above the noise floor [dB], bins of the running median and on either side of a joining peak that wait for
-#: the next round, peaks that join at once, and points of the periodogram for each bin.
+#: Least power above the noise floor [dB], bins of the running median and on either side of an added peak that wait for
+#: the next round, peaks added at once, and points of the periodogram for each bin.
 LEAST_DB, FLOOR_BINS, WAITING, TOGETHER, PADDING = 10.0, 51, 10, 8, 4
 ROUNDS, STEPS = 25, 10
 MOST_GROWTH, MOST_BEND, LONGEST_STEP = 4.0, 8.0, 2.0
@@ -26,7 +26,7 @@ EVERY = 0.005
 
 
 def model(u, parameters):
-    """Sum of the tones ``exp(g u) (a cos + b sin)(w u + c u^2)``, and its derivatives, shape (N, 5 n)."""
+    """Return the sum of the tones ``exp(g u) (a cos + b sin)(w u + c u^2)``, and its derivatives, shape (N, 5 n)."""
     a, b, g, w, c = parameters
     angle, grown = np.outer(u, w) + np.outer(u**2, c), np.exp(np.outer(u, g))
     cosine, sine = grown * np.cos(angle), grown * np.sin(angle)
@@ -36,7 +36,7 @@ def model(u, parameters):
 
 
 def fit(y, parameters):
-    """Return fitted parameters, shape (5, n), and what they leave."""
+    """Return fitted parameters, shape (5, n), and the residual."""
     u = np.linspace(-1.0, 1.0, y.size)
     value, slopes = model(u, parameters)
     left, damping = y - value, 1e-3
@@ -69,7 +69,7 @@ def noise_floor(left, bins):
 
 
 def joining(left, there):
-    """Return the strongest peaks [bins] that are 10 dB above the noise floor, not within a bin of what is there."""
+    """Return the strongest peaks [bins] that are 10 dB above the noise floor, not within a bin of given ones."""
     power = np.abs(np.fft.rfft(left, PADDING * left.size)) ** 2 / left.size
     bins = np.arange(power.size) / PADDING
     ratio = power / noise_floor(left, bins)
@@ -101,7 +101,7 @@ def partials(y):
 
 
 def readings_twice(hertz, valid, window):
-    """Return how many valid readings of one row are within one bin of another."""
+    """Return the number of valid readings of one row within one bin of another."""
     count = 0
     for row, here in enumerate(valid):
         order = np.flatnonzero(here)[np.argsort(hertz[row, here])]
@@ -111,7 +111,7 @@ def readings_twice(hertz, valid, window):
 
 
 def compare(file, windows):
-    """Print, for each window of a record, the partials of the fit and those that the track keeps."""
+    """Print, for each window of a record, the partials of the fit and those kept by the track."""
     record = read_sampled_signal(file).in_seconds()
     found = track(record, every=EVERY)
     hertz = found.omega / (2.0 * np.pi)

@@ -1,9 +1,9 @@
-"""One pass over a record, ns of processor time a sample, beside the same pass written in C and compiled on the spot.
+"""One pass over a record, ns of processor time per sample, compared with the same pass in C, compiled here.
 
     python benchmarks/bench_passes.py
 
 Ours also finds the poles, the partial fractions and the map to the standard rows; the reference is given the poles.
-Where no C compiler is found only our times are printed.
+Without a C compiler only our times are printed.
 """
 
 import ctypes
@@ -25,7 +25,7 @@ REPEATS = 200
 
 
 def compiled(compiler, modes, folder):
-    """The reference for so many pairs of poles."""
+    """Compile the reference for a number of pole pairs."""
     library = Path(folder) / f"pass{modes}.so"
     source = Path(__file__).with_name("pass_reference.c")
     flags = ["-O3", "-march=native", "-ffast-math", "-shared", "-fPIC", f"-DMODES={modes}"]
@@ -34,7 +34,7 @@ def compiled(compiler, modes, folder):
 
 
 def reference(library, data, poles, residues, delay):
-    """A call of the reference, and what it fills."""
+    """Return a call of the reference, and its output array."""
     gram = np.zeros((6 * poles.size + 2,) * 2)
 
     def address(array):
@@ -60,7 +60,7 @@ def main():
             a, b = system.denominator, system.numerator
             form = modal_form(a, b)
             poles, residues = form.poles, np.ascontiguousarray(form.residues[:, 0])
-            # The reference has the error last, and the filtered output before it.
+            # The last row of the reference is the error, after the filtered output.
             size = form.mapping.shape[1]
             order = [*range(4 * poles.size + 1), size - 1, *range(4 * poles.size + 1, size - 1)]
             library = compiled(compiler, poles.size, folder) if compiler else None

@@ -1,11 +1,11 @@
-"""Whether the remedies that ``ctid fit`` prints help on the last quarter of a record, which nothing has seen.
+"""Benefit of the remedies that ``ctid fit`` prints, on the last quarter of a record, which no fit uses.
 
     python benchmarks/bench_remedies.py [--seed SEED] [--records N] [RECORD.csv ...]
 
 Simulated records have one planted fault each: a pole too few, a range of delays too short, an integrator left out, or
-outliers. Each is fitted on its first three quarters; every remedy that is printed is obeyed, and both fits are judged
-on the last quarter, through which the input and the state are carried. A planted fault counts where it costs more than
-three points of fit there. Measured records, named on the command line, are fitted with one, two and three poles.
+outliers. Each is fitted on its first three quarters; every printed remedy is applied, and both fits are compared on the
+last quarter, through which input and state are simulated. A planted fault counts if it costs more than three points of
+fit there. Measured records, named on the command line, are fitted with one, two and three poles.
 """
 
 import argparse
@@ -19,15 +19,15 @@ from ctid_cli.errors import CtidError
 from ctid_cli.identification.remedies import tried_remedies
 
 FAULTS = ("poles", "delay", "integrator", "outliers")
-#: Options that mend a fault.
+#: Options that remove a fault.
 CURES = {"poles": "--poles", "delay": "--delay", "integrator": "--integrators", "outliers": "--loss"}
-#: Part of a record that is fitted, and points of fit from which on a fault counts.
+#: Part of a record that is fitted, and points of fit from which a fault counts.
 FITTED, COSTLY = 0.75, 3.0
 
 
 @dataclass
 class Case:
-    """A record, the options that are typed, and those without the fault."""
+    """A record, the given options, and those without the fault."""
 
     record: Record
     typed: DelayProfile
@@ -36,7 +36,7 @@ class Case:
 
 
 def system(rng, samples, integrating):
-    """Numerator, denominator, delay [samples] of a random system of known structure; the interval is 1."""
+    """Return numerator, denominator, delay [samples] of a random system of known structure; the interval is 1."""
     poles = int(rng.integers(1, 5))
     slowest = 1.0 / np.exp(rng.uniform(np.log(3.0), np.log(samples / 15.0)))
     free, roots, speed = poles - integrating, [], slowest
@@ -56,7 +56,7 @@ def system(rng, samples, integrating):
 
 
 def drive(rng, t, hold, before):
-    """A pseudo-random binary signal, a step after some samples that are not recorded, or a multisine."""
+    """Return a pseudo-random binary signal, a step after some samples that are not recorded, or a multisine."""
     kind = rng.choice(["binary", "step", "multisine"]) if hold == "zoh" else "multisine"
     samples = t.size
     if kind == "step":
@@ -69,7 +69,7 @@ def drive(rng, t, hold, before):
 
 
 def noise(rng, samples):
-    """White noise, or first-order autoregressive noise, of variance 1."""
+    """Return white noise, or first-order autoregressive noise, of variance 1."""
     white = rng.standard_normal(samples)
     if rng.random() < 0.5:
         return white
@@ -80,7 +80,7 @@ def noise(rng, samples):
 
 
 def made(rng, fault):
-    """A simulated record with a planted fault; None where the system has nothing that could be left out."""
+    """Return a simulated record with a planted fault; None if the system has nothing to leave out."""
     samples = int(np.exp(rng.uniform(np.log(300), np.log(1000))))
     integrating = int(fault == "integrator" or (fault != "integrator" and rng.random() < 0.25))
     numerator, denominator, delay = system(rng, samples, integrating)
@@ -126,57 +126,57 @@ def made(rng, fault):
 
 
 def first_part(record):
-    """The part of a record that is fitted."""
+    """Return the fitted part of a record."""
     n = int(FITTED * record.n_samples)
     t = record.t[:n]
     return Record(t, record.y[:n], HeldSignal(t, record.input.values[:n], record.input.hold), name=record.name)
 
 
 def judged(options, record):
-    """Fit [%] of the last quarter by what was fitted to the rest, as ``ctid fit`` does."""
+    """Return the fit [%] of the last quarter by the fit to the rest, as in ``ctid fit``."""
     n = int(FITTED * record.n_samples)
     fit = options.fit(first_part(record))
     whole = options.prepare(record).laid_out
     offset = fit.offsets[0] if options.offset == "remove" else 0.0
     simulated = np.full(record.n_samples, np.nan)
     simulated[whole.used()[0]] = options._simulated(fit, whole)[0] + offset
-    # In shares of what the output varies in the whole record: after a step it does not at the end.
+    # Relative to the variation in the whole record: after a step the output is constant at the end.
     error = record.y[n:] - simulated[n:]
     return fit, 100 * (1 - np.sqrt(np.mean(error**2)) / record.y.std())
 
 
 def held(record, hold):
-    """A record whose input is otherwise between its samples."""
+    """Return a record with another hold of its input."""
     return Record(record.t, record.y, HeldSignal(record.input.t, record.input.values, hold), name=record.name)
 
 
 def remedies_of(record, options):
-    """Each remedy of a fit with its own last quarter before and after."""
+    """Yield each remedy of a fit with its last quarter before and after."""
     fit, before = judged(options, record)
     part = first_part(record)
     began = time.process_time()
     found = tried_remedies([part], options, fit).remedies
     seconds = time.process_time() - began
     fits = [before, *(judged(one.options, held(record, one.hold))[1] for one in found)]
-    # Each remedy is obeyed besides those before it.
+    # Each remedy is added to those before it.
     return before, list(zip(found, fits[:-1], fits[1:], strict=True)), seconds
 
 
 def tell(found):
-    """Print remedies and what they give."""
+    """Print remedies and their effect."""
     for one, worse, better in found:
         print(f"    {'ok ' if better > worse else 'BAD'} {better:.1f} {one}")
 
 
 def report(rows):
-    """Print which share of the remedies helped."""
+    """Print the share of helpful remedies."""
     helped = [after > before for before, after in rows]
     share = 100 * np.mean(helped) if helped else np.nan
     print(f"remedies printed: {len(rows)}; obeyed, {sum(helped)} ({share:.0f} %) improve the last quarter")
 
 
 def summary(rows, costly, spent):
-    """Print which remedies helped, which faults were named, and the time of the trials."""
+    """Print helpful remedies, reported faults, and the time of the trials."""
     report(rows)
     for fault in FAULTS:
         of_fault = [case for case in costly if case[0] == fault]

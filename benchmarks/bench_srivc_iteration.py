@@ -34,7 +34,7 @@ def noisy_record(system, n_samples, interval, regular):
 
 
 def iteration_times(problem, theta, variant):
-    """Seconds per iteration, one entry per repeat; the first, which may compile, is left out."""
+    """Return the seconds per iteration of each repeat; the first one, which may compile, is left out."""
     times = []
     for _ in range(REPEATS + 1):
         seconds, result = cpu(iterate, problem, theta, Steps(ITERATIONS, 1e-300, variant))

@@ -1,11 +1,11 @@
-"""What reading many stored estimates and writing runs.h5 cost: processor time and memory of every command.
+"""Cost of reading many stored estimates and of writing runs.h5: processor time and memory of every command.
 
     python benchmarks/bench_storage.py [ESTIMATES] [--only write,table,...] [--keep FOLDER]
 
-Makes the results of an experiment with so many estimates (100,000 if nothing is said; two estimators from two starts at
-ten noise levels, rows as quickstart has them, one in a thousand a failure), through the same journal as a run, and
-then gives each command in a process of its own. Nothing is estimated. `write` is a run that finds everything done but
-not exported, so that it writes runs.h5; `run` is one that finds it exported too.
+Makes the results of an experiment with the given number of estimates (100,000 by default; two estimators from two
+starts at ten noise levels, rows as in quickstart, one failure in a thousand), through the same journal as a run, and
+then runs each command in its own process. Nothing is estimated. `write` is a run that finds everything done but not
+exported, so that it writes runs.h5; `run` is one that finds it exported too.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ COMMANDS = ("status", "write", "run", "status", "table", "show", "figure", "expo
 
 
 def specification(estimates: int) -> dict[str, Any]:
-    """Quickstart with as many data sets as make so many estimates."""
+    """Return quickstart with the number of data sets for a number of estimates."""
     spec: dict[str, Any] = yaml.safe_load((ROOT / "configs" / "quickstart.yaml").read_text(encoding="utf-8"))
     spec["experiment"] = NAME
     spec["noise"]["snr_db"] = [float(k) for k in range(LEVELS)]
@@ -55,7 +55,7 @@ def specification(estimates: int) -> dict[str, Any]:
 
 
 def outcomes(plan: Any, manifest: dict[str, Any]) -> Iterator[Outcome]:
-    """An outcome for every place: the real ones of the first data set with other last digits."""
+    """Yield an outcome for every place: the real ones of the first data set with other last digits."""
     rng = np.random.default_rng(1)
     real = {o.key[2:]: o for o in run_job(plan.job(0, 0)) if isinstance(o, Outcome)}
     for key in _in_order(manifest):
@@ -68,7 +68,7 @@ def outcomes(plan: Any, manifest: dict[str, Any]) -> Iterator[Outcome]:
 
 
 def _in_order(manifest: dict[str, Any]) -> Iterator[Key]:
-    """All estimates in the order of the journal, which is the quickest to write."""
+    """Yield all estimates in the order of the journal, which is the quickest to write."""
     for cell in sorted(manifest["data_cells"], key=lambda cell: str(cell["hash"])):
         for replicate in range(cell["replicates"]):
             for part in sorted(manifest["estimators"], key=lambda part: str(part["hash"])):
@@ -85,7 +85,7 @@ def _other(value: Any, factors: Iterator[float]) -> Any:
 
 
 def fill(folder: Path, spec: Path) -> None:
-    """A journal as a run that was killed before it wrote runs.h5 leaves it."""
+    """Write a journal like that of a run that was killed before it wrote runs.h5."""
     plan = build_plan(load_spec(spec))
     manifest = plan.manifest()
     (folder / NAME).mkdir(parents=True)
@@ -103,7 +103,7 @@ def fill(folder: Path, spec: Path) -> None:
 
 
 def measure(name: str, folder: Path, spec: Path) -> None:
-    """Give one command and print what it took."""
+    """Run one command and print its cost."""
     results = ["--out", str(folder)]
     some = ""
     if name == "show":

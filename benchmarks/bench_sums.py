@@ -1,4 +1,4 @@
-"""Sums of submodels with their delay searched, on simulated records, against the Cramér-Rao bound.
+"""Sums of submodels with unknown delay, on simulated records, compared with the Cramér-Rao bound.
 
     python benchmarks/bench_sums.py [--records 300] [--samples 600] [--snr-db 15] [--seed 1] [--estimate] [--chosen]
 
@@ -32,7 +32,7 @@ PLANT, INTERVAL, DELAYS = AdditiveModel.from_theta(TRUE[:-1], MODES, TRUE[-1]), 
 
 
 def simulated(samples, snr_db, seed, replicate):
-    """A record, and the standard deviations of the bound, from rest and without an offset."""
+    """Return a record, and the standard deviations of the bound, from rest and without an offset."""
     t = INTERVAL * np.arange(samples)
     signal = HeldSignal(t, stream(seed, "input", replicate).choice([-1.0, 1.0], samples))
     x = simulate_additive(PLANT, signal, t)

@@ -1,10 +1,10 @@
-"""A minute of sound: how many times faster than real time it is tracked, by one thread in process and by the command.
+"""Speed of tracking a minute of sound, relative to real time, by one thread in process and by the command.
 
     python benchmarks/bench_track.py [--runs 3]
 
 The shortest of some runs, after one that compiles; in process, processor time with the number of tones given and by
-default, at 1, 8 and 48 kHz; the whole command, start, figure and files included, at 48 kHz. The targets at 48 kHz are
-20 times in process, 12 times for the command, and 600 MB.
+default, at 1, 8 and 48 kHz; for the whole command, including start, figure and files, at 48 kHz. The targets at 48 kHz
+are 20 times in process, 12 times for the command, and 600 MB.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from ctid_cli.tones.track import track
 
 SECONDS = 60
 RATES = (1_000, 8_000, 48_000)
-#: Frequencies [Hz]: low ones let a record be thinned, high ones do not.
+#: Frequencies [Hz]: low ones, for which records can be thinned, and high ones, for which they cannot.
 KINDS = {"one tone": (440.0,), "mains": (50.0, 100.0, 150.0), "up to 3 kHz": (440.0, 1000.0, 3000.0)}
 
 
@@ -43,7 +43,7 @@ def sound(frequencies, rate):
 
 
 def in_process(samples, rate, tones, runs):
-    """Times real time by processor time."""
+    """Return the speed relative to real time by processor time."""
     record, used = Recorded(samples / 32768.0, 1.0 / rate), []
     for _ in range(runs):
         begun = time.process_time()
@@ -53,7 +53,7 @@ def in_process(samples, rate, tones, runs):
 
 
 def of_command(samples, rate, tones, runs):
-    """Times real time by the clock."""
+    """Return the speed relative to real time by wall time."""
     used = []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "sound.wav")

@@ -1,7 +1,7 @@
-"""Whether pointwise bands contain the true responses: ``python -m benchmarks.interval_bands [RUNS]``.
+"""Coverage of the true responses by pointwise bands: ``python -m benchmarks.interval_bands [RUNS]``.
 
-The data sets of rows a, c, d and f of the study, fitted as there, and of each fit the linearised bands of gain and
-phase, of the step response, and of the output for an input that is not the experiment's. Writes ``bands.csv`` and
+Uses the data sets of rows a, c, d and f of the study, fitted as there, and for each fit the linearised bands of gain
+and phase, of the step response, and of the output for an input other than the experiment's. Writes ``bands.csv`` and
 ``bands.md`` to ``results/published/intervals``.
 """
 
@@ -26,7 +26,7 @@ from ctid_cli.specification.load import load_spec
 
 ROOT = Path(__file__).resolve().parents[1]
 PUBLISHED = ROOT / "results" / "published" / "intervals"
-#: Row of the study, specification, what the noise is taken for, and a time constant of the system [s].
+#: Row of the study, specification, assumed noise, and a time constant of the system [s].
 ROWS = (
     ("a", "case1_regular", "white", 0.5),
     ("c", "first_order", "white", 3.0),
@@ -39,13 +39,13 @@ RESPONSES = ("gain", "phase", "step response", "simulated output")
 
 
 def other_input(unit: float) -> HeldSignal:
-    """An input that no experiment had: random levels, held for broken numbers of time constants."""
+    """Return an input unlike that of any experiment: random levels, held for fractional numbers of time constants."""
     rng = np.random.default_rng(7)
     return HeldSignal(np.cumsum(rng.uniform(0.3, 2.0, 20)) * unit, rng.standard_normal(20))
 
 
 def hits_of(fit: FittedModel, truth: TransferFunction, unit: float) -> dict[str, Array]:
-    """Which true values the bands of one fit hold, by response."""
+    """Return which true values the bands of one fit contain, by response."""
     w, t, signal = OVER / unit, truth.delay + AFTER * unit, other_input(unit)
     late = truth.delay + unit * np.array([3.0, 8.0, 12.0, 17.0])
     frequency = fit.frequency_response(w)
@@ -63,7 +63,7 @@ def hits_of(fit: FittedModel, truth: TransferFunction, unit: float) -> dict[str,
 
 
 def coverage(letter: str, config: str, kind: Any, unit: float, runs: int) -> list[dict[str, Any]]:
-    """A line for each response and place of one row."""
+    """Return a line for each response and place of one row."""
     plan = build_plan(load_spec(ROOT / "configs" / "coverage" / f"{config}.yaml"))
     (cell,), (estimator,) = plan.data_cells, plan.estimators
     truth, held = cell.source.system, []
@@ -95,7 +95,7 @@ def coverage(letter: str, config: str, kind: Any, unit: float, runs: int) -> lis
 
 
 def markdown(lines: list[dict[str, Any]]) -> str:
-    """All lines for people."""
+    """Return all lines for readers."""
     header = ["row", "covariance", "response", "place", "coverage %", "95 % interval"]
     rows = [
         [

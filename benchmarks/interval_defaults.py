@@ -1,7 +1,7 @@
 """Coverage of 95 % intervals with default settings: ``python -m benchmarks.interval_defaults [RUNS [SEED]]``.
 
-Three systems with a delay, after a PRBS and after a step, in white and in coloured noise. ``delay_profile`` is told
-nothing of the noise. Writes ``defaults.csv`` and ``defaults.md`` to ``results/published/intervals``.
+Three systems with a delay, after a PRBS and after a step, in white and in coloured noise. ``delay_profile`` gets no
+information on the noise. Writes ``defaults.csv`` and ``defaults.md`` to ``results/published/intervals``.
 """
 
 import itertools
@@ -32,7 +32,7 @@ from ctid_cli.storage.truth import found_of_rows
 
 SAMPLING = RegularSampling(interval=0.05, samples=600)
 DELAY = 0.63  # s, between samples
-#: Each mode of the third has at least a quarter of the variance of the output, after either input.
+#: Each mode of the third system has at least a quarter of the variance of the output, after either input.
 SYSTEMS = {
     "overdamped": TransferFunction([2], [0.4, 1.4, 1], DELAY),
     "resonant": TransferFunction([1], [0.25, 0.15, 1], DELAY),
@@ -58,18 +58,18 @@ LINES = [
     *(("step", snr, noise) for snr, noise in itertools.product((20.0, 15.0), BOUNDED)),
     *((name, snr, "AR(1) .95") for name, snr in (("prbs", 20.0), ("step", 30.0))),
 ]
-#: Of single systems and pooled.
+#: Results of a line, for a single system or pooled.
 Line = dict[str, Any]
 
 
 def noise_of(name: str, snr_db: float) -> Noise:
-    """A noise of a colour and a level."""
+    """Return noise of a colour and a level."""
     colour = NOISES[name]
     return WhiteNoise(snr_db=snr_db) if colour is None else ArmaNoise(*map(tuple, colour), snr_db=snr_db)
 
 
 def line_of(system: str, signal: str, snr_db: float, noise: str, runs: int, seed: int) -> Line:
-    """What was found of one system, by the numbers that an experiment stores."""
+    """Return the results for one system, from the numbers that an experiment stores."""
     truth = SYSTEMS[system]
     source = SimulatedSource(truth, INPUTS[signal], SAMPLING, noise_of(noise, snr_db), seed)
     zeros, names = truth.numerator.size - 1, (*truth.parameters, "delay")
@@ -107,7 +107,7 @@ def line_of(system: str, signal: str, snr_db: float, noise: str, runs: int, seed
 
 
 def ideal_errors(source: SimulatedSource, record: Any, names: Sequence[str]) -> Array:
-    """Standard errors of the same estimator if the system and the covariance of the noise were known."""
+    """Return standard errors of the same estimator with known system and covariance of the noise."""
     truth, noise = source.system, source.noise
     assert isinstance(truth, TransferFunction)
     assert isinstance(noise, Noise)
@@ -119,7 +119,7 @@ def ideal_errors(source: SimulatedSource, record: Any, names: Sequence[str]) -> 
 
 
 def pooled(lines: Sequence[Line]) -> Line:
-    """All systems together; of lengths the median of their medians."""
+    """Return all systems together; for lengths the median of their medians."""
     sums = {key: sum(line[key] for line in lines) for key in ("runs", "converged", "robust", "called_unsafe")}
     sums |= {key: sum(line[key] for line in lines) for key in ("covered", "intervals")}
     length = float(np.median([line["length_over_ideal"] for line in lines]))
@@ -127,20 +127,20 @@ def pooled(lines: Sequence[Line]) -> Line:
 
 
 def with_percent(line: Line) -> Line:
-    """A line with its coverage [%] and 95 % interval, as if intervals of one estimate were independent."""
+    """Return a line with its coverage [%] and 95 % interval, as if intervals of one estimate were independent."""
     low, high = wilson_interval(line["covered"], line["intervals"])
     return line | {"percent": 100 * line["covered"] / line["intervals"], "low": 100 * low, "high": 100 * high}
 
 
 def study(runs: int, seed: int, lines: Iterable[tuple[str, float, str]] = LINES) -> Iterator[Line]:
-    """A line for each system and all of them, of every input, level and noise."""
+    """Yield a line for each system and all of them, for every input, level and noise."""
     for signal, snr_db, noise in lines:
         own = [line_of(system, signal, snr_db, noise, runs, seed) for system in SYSTEMS]
         yield from (with_percent(line) for line in (*own, pooled(own)))
 
 
 def markdown(lines: Sequence[Line]) -> str:
-    """All lines for people."""
+    """Return all lines for readers."""
     header = ["input", "SNR [dB]", "noise", "system", "coverage %", "95 % interval", "length / ideal"]
     header += ["robust %", "called unsafe %", "converged %"]
     rows = [

@@ -1,10 +1,10 @@
-"""ctid beside numbers that others printed and beside exact bounds: the page docs/scoreboard.md.
+"""ctid compared with published numbers and with exact bounds: the page docs/scoreboard.md.
 
 python -m benchmarks.scoreboard                    # prints the page
 python -m benchmarks.scoreboard --write FILE.md
 
-Records that may not be redistributed are read from the folder that the environment variable CTID_DATA names; each must
-have the SHA-256 given here. Rows of records that are not there say "not run".
+Records that may not be redistributed are read from the folder in the environment variable CTID_DATA; each must have the
+SHA-256 given here. Rows of missing records say "not run".
 """
 
 import argparse
@@ -59,7 +59,7 @@ SAMPLES, INTERVAL, SNR_DB, DELAYS = 1000, 0.05, 15.0, (0.0, 1.5)
 
 
 class Row(NamedTuple):
-    """One comparison: what is compared, how, our number, that of others or of theory, and its source."""
+    """One comparison: subject, settings, our number, the reference by others or by theory, and its source."""
 
     subject: str
     settings: str
@@ -69,7 +69,7 @@ class Row(NamedTuple):
 
 
 class NotRunError(Exception):
-    """A record is not there, or is another one."""
+    """A record is missing, or has another content."""
 
 
 def record_of(name: str) -> Record:
@@ -84,7 +84,7 @@ def record_of(name: str) -> Record:
 
 
 def useful_redundancy() -> list[Row]:
-    """Mean percentages of the four printed tables, from the committed results."""
+    """Return mean percentages of the four printed tables, from the committed results."""
     table = pd.read_csv(PUBLISHED / "useful_redundancy" / "tables.csv")
     methods = {"existing": "`td_srivc`, one filter", "redundancy": "`useful_redundancy`"}
     rows = []
@@ -114,14 +114,14 @@ def useful_redundancy() -> list[Row]:
 
 
 def claim(study: str, experiment: str, start: str) -> str:
-    """Return what a study measured for a claim, from the committed results."""
+    """Return a study's measured value for a claim, from the committed results."""
     claims = pd.read_csv(PUBLISHED / study / "claims.csv")
     found = claims[(claims["experiment"] == experiment) & claims["claim"].str.startswith(start)]
     return str(found["measured"].item())
 
 
 def studies() -> list[Row]:
-    """Rows of the other studies, from the committed results."""
+    """Return rows of the other studies, from the committed results."""
     additive = "González et al. 2025, arXiv:2401.01263; theory: limit for long records"
     rows = []
     for experiment, estimator, parameter in (("open-loop", "srivc", "g2_b0"), ("closed-loop", "clsrivc", "g1_a2")):
@@ -163,7 +163,7 @@ def studies() -> list[Row]:
 
 
 def bounds(runs: int) -> list[Row]:
-    """RMSE over the Cramér-Rao bound of systems of first to fourth order, the delay searched."""
+    """Return RMSE over the Cramér-Rao bound of systems of first to fourth order, with unknown delay."""
     t = INTERVAL * np.arange(SAMPLES)
     rows = []
     for name, system in SYSTEMS.items():
@@ -195,7 +195,7 @@ def bounds(runs: int) -> list[Row]:
 
 
 def dryer() -> list[Row]:
-    """Delay and order of the DaISy dryer."""
+    """Return delay and order of the DaISy dryer."""
     record = record_of("daisy_dryer.csv")
     two = identify([record], DelayProfile(2, 0, (0.0, 1.0), initial_state="estimate", offset="estimate"))
     chosen = choose([record])
@@ -218,7 +218,7 @@ def dryer() -> list[Row]:
 
 
 def pt326() -> list[Row]:
-    """Structure of CONTSID's record of the PT326."""
+    """Return the structure of CONTSID's record of the PT326."""
     record, other = record_of("pt326_est.csv"), record_of("pt326_val.csv")
     rows = []
     for poles in (1, 2):
@@ -252,7 +252,7 @@ def _variance_in_discrete_time(u: np.ndarray, y: np.ndarray) -> float:
 
 
 def gas_furnace() -> list[Row]:
-    """Structure of Box and Jenkins' series J."""
+    """Return the structure of Box and Jenkins' series J."""
     record = record_of("gas_furnace.csv")
     found = identify([record], Given(poles=1, noise_model="arma:2,0"))
     noise = found.fit.noise.noise
@@ -284,7 +284,7 @@ def gas_furnace() -> list[Row]:
 
 
 def silverbox() -> list[Row]:
-    """Linear models of second order of the Silverbox."""
+    """Return linear models of second order of the Silverbox."""
     record = record_of("silverbox_est.csv")
     tests = {
         name: record_of(f"silverbox_test_{name}.csv") for name in ("multisine", "arrow_full", "arrow_no_extrapolation")
@@ -304,7 +304,7 @@ def silverbox() -> list[Row]:
 
 
 def rows_of(section, *arguments) -> list[Row]:
-    """Return a section's rows, or one that says what is missing."""
+    """Return a section's rows, or one that names the missing record."""
     try:
         return section(*arguments)
     except NotRunError as missing:

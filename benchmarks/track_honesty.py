@@ -1,14 +1,14 @@
-"""Is a row of a track right that is called valid? Random signals, asked for too few, enough and too many tones.
+"""Correctness of valid rows of tracks. Random signals, with too small, correct and too large numbers of tones.
 
     python benchmarks/track_honesty.py [--signals 1000] [--seed 1] [--show]
 
-Signals of 1000 to 8000 samples: none to five tones over 60 dB, a quarter of them 3 to 12 bins beside another, steady,
+Signals of 1000 to 8000 samples: none to five tones over 60 dB, a quarter of them 3 to 12 bins from another, steady,
 drifting, decaying or with a step of phase, frequency or amplitude, some with harmonics; white or coloured noise 10 to
-60 dB below the strongest, some with spikes or a gap. A valid row is wrong if its frequency is off the nearest true one
-by more than 3.3 of its standard errors and more than .001 of the frequency. A row could be right if the bound of Cramer
-and Rao for the stretch between two events of the signal (rate of change unknown) is below the accuracy, its tone is no
-weaker than six standard errors of its amplitude and three bins of the stretch from any other. All rows that could be
-right count, whether the tracker found their tone or not; asked for one tone fewer, only wrong rows count.
+60 dB below the strongest, some with spikes or a gap. A valid row is wrong if its frequency differs from the nearest
+true one by more than 3.3 of its standard errors and more than .001 of the frequency. A row could be right if the
+Cramer-Rao bound for the stretch between two events of the signal (rate of change unknown) is below the accuracy, its
+amplitude is at least six of its standard errors, and any other tone at least three bins of the stretch away. All rows
+that could be right count, found or not; with one tone too few, only wrong rows count.
 
 Then: named cases, in which no valid row may be off by more than .02 Hz or 3.3 of its standard errors, whichever is
 larger; and coverage of the standard errors and their size relative to the bound, for one to three steady tones in white
@@ -39,7 +39,7 @@ class Recorded(NamedTuple):
 
 
 class Tone(NamedTuple):
-    """A tone that is in a signal."""
+    """A tone of a signal."""
 
     #: Frequency at each sample [1/sample].
     frequency: np.ndarray
@@ -49,7 +49,7 @@ class Tone(NamedTuple):
 
 
 class Signal(NamedTuple):
-    """A random signal and what it is made of."""
+    """A random signal and its components."""
 
     samples: np.ndarray
     tones: list[Tone]
@@ -60,7 +60,7 @@ class Signal(NamedTuple):
 
 
 def random_signal(rng: np.random.Generator) -> Signal:
-    """One of the signals."""
+    """Return a random signal."""
     size = int(rng.choice([1000, 2000, 4000, 8000]))
     low, high = max(12.0 / size, 0.01), 0.45
     tones: list[Tone] = []
@@ -95,7 +95,7 @@ def random_signal(rng: np.random.Generator) -> Signal:
 
 
 def _moving(rng: np.random.Generator, kind: str, size: int, centre: float, amplitude: float) -> tuple[Tone, np.ndarray]:
-    """A tone of a kind, and its phase."""
+    """Return a tone of a kind, and its phase."""
     place, event = np.arange(size), int(rng.uniform(0.2, 0.8) * size)
     frequency, height, jump = np.full(size, centre), np.full(size, amplitude), 0.0
     if kind == "drift":
@@ -113,7 +113,7 @@ def _moving(rng: np.random.Generator, kind: str, size: int, centre: float, ampli
 
 
 def could_be_right(signal: Signal, places: np.ndarray) -> np.ndarray:
-    """For each tone and place, shape (tones, places)."""
+    """Return whether a row could be right for each tone and place, shape (tones, places)."""
     cuts = np.unique([0, signal.samples.size, *signal.events])
     possible = np.zeros((len(signal.tones), places.size), bool)
     for j, tone in enumerate(signal.tones):
@@ -135,7 +135,7 @@ def could_be_right(signal: Signal, places: np.ndarray) -> np.ndarray:
 
 
 def judged(signal: Signal, found: Track) -> tuple[int, int, int, int]:
-    """Valid rows, wrong ones; rows that could be right, and how many of them are valid and right."""
+    """Return the numbers of valid rows and of wrong ones, of rows that could be right, and of those valid and right."""
     places = np.minimum(np.round(found.t).astype(int), signal.samples.size - 1)
     possible = could_be_right(signal, places)
     valid = wrong = 0
@@ -152,7 +152,7 @@ def judged(signal: Signal, found: Track) -> tuple[int, int, int, int]:
 
 
 def honesty(signals: int, seed: int, show: bool) -> None:
-    """The table of the first question."""
+    """Print the table of random signals."""
     print(f"{'asked for':12} {'valid rows':>10} {'wrong':>7} {'':8} {'could be right':>14} {'valid of them':>13}")
     for name, more in (("one fewer", -1), ("as many", 0), ("two more", 2), ("auto", None)):
         total = np.zeros(4, int)
@@ -177,7 +177,7 @@ def honesty(signals: int, seed: int, show: bool) -> None:
 
 
 def named_cases(records: int, seed: int) -> None:
-    """The table of the named cases: rows of some records of each, at 1 kHz."""
+    """Print the table of the named cases: rows of some records of each, at 1 kHz."""
     print(f"\n{'named case':34} {'rows':>6} {'valid':>7} {'wrong':>6}")
     for name, seconds, tones, make in NAMED:
         total = np.zeros(3, int)
@@ -231,7 +231,7 @@ def _short(t: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, tuple[f
 
 
 RATE = 1000.0
-#: Name, seconds, number of tones that is asked for, and a function: the samples and the true frequencies [Hz].
+#: Name, seconds, requested number of tones, and a function: the samples and the true frequencies [Hz].
 NAMED = (
     ("85 Hz at a tenth, 60 Hz, tones=1", 8.0, 1, _weak),
     ("30 and 30.5 Hz, 8 s, tones=1", 8.0, 1, _close),
@@ -244,7 +244,7 @@ NAMED = (
 
 
 def efficiency(records: int, seed: int) -> None:
-    """The table of the second question: steady tones, N = 2000, 20 dB, errors in the middle of the record."""
+    """Print the table of efficiency: steady tones, N = 2000, 20 dB, errors in the middle of the record."""
     print(f"\n{'tones':5} {'noise':8} {'covered':>8} {'rmse / bound':>12}")
     size, omega = 2000, np.array([0.6, 1.1, 1.9])
     for pole in (0.0, 0.9):

@@ -1,4 +1,4 @@
-"""What all commands share: the results option, and how errors reach the user."""
+"""Common parts of all commands: the results option, and reporting of errors."""
 
 import contextlib
 import errno
@@ -46,14 +46,14 @@ Fresh = Annotated[bool, flag("--fresh", "Move older results aside and start anew
 Config = Annotated[Path, typer.Argument(metavar="CONFIG", help="Experiment file (YAML).")]
 Configs = Annotated[list[Path], typer.Argument(metavar="CONFIG", help="Experiment files (YAML).")]
 
-#: Options that say where and in what form results are written, not what they are.
+#: Options on where and in what form results are written, which do not change their content.
 _OF_OUTPUT = ("format", "json", "out", "report", "csv", "export")
-#: Errors that are the disk's: full, over quota, read-only, or failing.
+#: Errors of the disk: full, over quota, read-only, or failing.
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
 
 
 class Command(TyperCommand):
-    """A command that refuses an option given twice, of which all but the last value would be lost."""
+    """A command that refuses an option given twice, as only its last value would count."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line."""
@@ -70,7 +70,7 @@ class Command(TyperCommand):
 
 
 class ComputingCommand(Command):
-    """A command that says so when it has to wait for compiled functions."""
+    """A command that announces when it waits for compiled functions."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
@@ -83,7 +83,7 @@ class ComputingCommand(Command):
 
 
 def duration(text: str) -> float:
-    """A time such as ``90s``, ``30m`` or ``1h30m`` in seconds."""
+    """Return a time such as ``90s``, ``30m`` or ``1h30m`` in seconds."""
     found = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+)s)?", text.strip())
     parts = [float(part or 0) for part in found.groups()] if found else []
     if not any(parts):
@@ -93,7 +93,7 @@ def duration(text: str) -> float:
 
 
 def given_command(context: typer.Context) -> str:
-    """The command that runs, with the options that are not as they would be without being given, but for outputs."""
+    """Return the command that runs, with the options that differ from their defaults, except those of outputs."""
     words = context.command_path.split()
     for option in context.command.params:
         value = context.params.get(str(option.name))
@@ -106,7 +106,7 @@ def given_command(context: typer.Context) -> str:
 
 
 def span(text: str, number: Callable[[str], Number]) -> tuple[Number, Number] | None:
-    """The ends of ``LOW:HIGH``, or one value twice; None of anything else."""
+    """Return the ends of ``LOW:HIGH``, or one value twice; None for anything else."""
     low, colon, high = text.partition(":")
     try:
         return number(low), number(high if colon else low)
@@ -115,7 +115,7 @@ def span(text: str, number: Callable[[str], Number]) -> tuple[Number, Number] | 
 
 
 def emit(result: Result, form: Format, written: Sequence[Path] = (), stored: str | None = None) -> None:
-    """Print a result in the form that is asked for, JSON as it was stored, and name the files that were written."""
+    """Print a result in the requested form, JSON as it was stored, and name the written files."""
     names = list(map(str, written))
     if form == "json":
         if stored is None:
@@ -123,7 +123,7 @@ def emit(result: Result, form: Format, written: Sequence[Path] = (), stored: str
             stored = json.dumps(plain({**content, "written": names} if names else content), allow_nan=False)
         typer.echo(stored.rstrip("\n"))
         return
-    # In a terminal text fits in its lines; in a pipe or a file it is the same everywhere.
+    # Text is wrapped to a terminal, but is the same everywhere in a pipe or a file.
     columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
     typer.echo(result.write(form, columns))
     if names and form == "text":
@@ -131,7 +131,7 @@ def emit(result: Result, form: Format, written: Sequence[Path] = (), stored: str
 
 
 def refuse_overwriting(inputs: Iterable[Path], written: Sequence[Path]) -> None:
-    """Refuse, before anything is computed, to write over what is read or below a file."""
+    """Refuse, before anything is computed, to overwrite an input, or to write below a file."""
     for folder in {folder for path in written for folder in path.parents if folder.is_file()}:
         raise StorageError(f"{folder} is a file, not a folder to write in")
     for file, path in itertools.product(inputs, written):
@@ -140,7 +140,7 @@ def refuse_overwriting(inputs: Iterable[Path], written: Sequence[Path]) -> None:
 
 
 def require_within(out: Path, *places: Path) -> None:
-    """Refuse to write where a link leads out of the results folder: who made the link is not who gave the command."""
+    """Refuse to write where a link leads out of the results folder: the user may not know of the link."""
     for path in places:
         real = Path(os.path.realpath(path))
         if not real.is_relative_to(os.path.realpath(out)):
@@ -148,7 +148,7 @@ def require_within(out: Path, *places: Path) -> None:
 
 
 def write_files(files: Mapping[Path, bytes | Iterable[bytes]], within: Path | None = None) -> None:
-    """Write files, and make the folders that they need; within a folder, if its user did not name the files."""
+    """Write files, with the folders that they need; within a folder, unless the user named the files."""
     for path, content in files.items():
         if within is not None:
             require_within(within, path)
@@ -162,7 +162,7 @@ def write_files(files: Mapping[Path, bytes | Iterable[bytes]], within: Path | No
 
 
 def printable(text: str) -> str:
-    """A message without characters that would steer a terminal: what it quotes may come from anywhere."""
+    """Return a message without control characters of a terminal: quoted text may come from anywhere."""
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -198,7 +198,7 @@ def guarded(function: Function) -> Function:
 
 
 def _report(error: Exception, out: Path | None) -> NoReturn:
-    """Say that an error was not foreseen, and where its details are."""
+    """Report an unforeseen error, and where its details are."""
     file, kind = _write_traceback(out), type(error).__name__
     typer.echo(f"ctid: unexpected error ({kind}: {_one_line(error)}); please report it with {file}", err=True)
     raise typer.Exit(ExitCode.INTERNAL) from None

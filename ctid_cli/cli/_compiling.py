@@ -1,4 +1,4 @@
-"""One sentence on stderr while numerical routines are compiled."""
+"""Notice on stderr while numerical routines are compiled."""
 
 import threading
 import time
@@ -7,13 +7,13 @@ from typing import Any
 import typer
 from numba.core import event
 
-#: Compilation that takes longer than this in all is announced [s].
+#: Total time of compilation from which it is announced [s].
 SILENT = 2.0
 ANNOUNCEMENT = "ctid: compiling numerical routines, up to 20 s; this happens once after an installation or an update"
 
 
 class CompilationNotice(event.Listener):
-    """Announces compilation, once, when it has taken some time; what is loaded from the cache on disk is no event."""
+    """Announces compilation, once, when it takes long; loading from the cache on disk causes no event."""
 
     def __init__(self) -> None:
         self._left = SILENT
@@ -23,8 +23,8 @@ class CompilationNotice(event.Listener):
         self._announced = False
 
     def on_start(self, event: Any) -> None:
-        """Begin to wait; of the functions that a compiled one calls nothing is counted twice."""
-        # Under Numba's lock, as is the end: of all threads only one compiles.
+        """Start to measure; functions called by a compiled one are not counted twice."""
+        # Numba's lock is held here and at the end: only one thread compiles at a time.
         self._depth += 1
         if self._depth == 1 and not self._announced:
             self._began = time.monotonic()
@@ -33,7 +33,7 @@ class CompilationNotice(event.Listener):
             self._timer.start()
 
     def on_end(self, event: Any) -> None:
-        """Count the time that a function has taken."""
+        """Add the time of a function."""
         self._depth -= 1
         if self._depth == 0 and self._timer is not None:
             self._timer.cancel()

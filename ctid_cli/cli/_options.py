@@ -1,6 +1,6 @@
-"""Options that several commands share, each written once.
+"""Options that several commands share.
 
-A parameter of a command whose type is a dataclass stands for the options that its fields are.
+A parameter of a command whose type is a dataclass stands for one option for each of its fields.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace each dataclass among the parameters of a command by the options that its fields are."""
+    """Replace each dataclass among the parameters of a command by options for its fields."""
     signature = inspect.signature(command, eval_str=True)
     groups: dict[str, Any] = {
         name: each.annotation for name, each in signature.parameters.items() if is_dataclass(each.annotation)
@@ -45,7 +45,7 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def wrapper(*values: Any, **given: Any) -> None:
         for name, group in groups.items():
-            # Who calls a command from Python may give the whole group.
+            # A caller from Python may pass the whole group.
             if not isinstance(given.get(name), group):
                 known = {option.name for option in fields(group)} & given.keys()
                 given[name] = group(**{option: given.pop(option) for option in known})
@@ -63,7 +63,7 @@ def flag(name: str, help: str, metavar: str | None = None, **more: Any) -> Any:
 
 
 def finite(text: str) -> float:
-    """A finite number."""
+    """Return a finite number."""
     with contextlib.suppress(ValueError):
         if math.isfinite(float(text)):
             return float(text)
@@ -71,7 +71,7 @@ def finite(text: str) -> float:
 
 
 def positive(text: str) -> float:
-    """A positive number whose reciprocal is finite too."""
+    """Return a positive number whose reciprocal is finite too."""
     value = finite(text)
     if not (value > 0 and math.isfinite(1.0 / value)):
         raise typer.BadParameter(f"must be a positive number, not {text!r}")
@@ -89,7 +89,7 @@ Validate = Annotated[Path | None, flag("--validate", "Validate on this record to
 
 @dataclass(frozen=True)
 class RecordOptions:
-    """Which columns and which part of measured records are used."""
+    """Columns and part of measured records to use."""
 
     time: TimeColumn = None
     input: Annotated[list[str] | None, flag("--input", "Column of the input; repeatable.", "NAME")] = None
@@ -106,7 +106,7 @@ class RecordOptions:
         return tuple(split_header(name)[0] for name in several)
 
     def read(self, file: Path, hold: Any, **others: Any) -> Measurement:
-        """Read a record, between the instants that are given."""
+        """Read a record between the given instants."""
         return self._read(file, hold, start=self.start, stop=self.stop, **others)
 
     def _read(self, file: Path, hold: Any, **others: Any) -> Measurement:
@@ -120,24 +120,24 @@ class RecordOptions:
         return read_measurement(file, time=self.time, input=self.input or None, output=output, hold=hold, **others)
 
     def read_all(self, files: Sequence[Path], validate: Path | None, hold: Any, **others: Any) -> MeasuredRecords:
-        """Read records, and one for validation from its beginning to its end; a DataError where their units differ."""
+        """Read records, and a whole one for validation; a DataError if their units differ."""
         from ctid_cli.reporting.records import Records
 
         other = None if validate is None else self._read(validate, hold, **others)
         records = Records([self.read(file, hold, **others) for file in files], other)
-        # Units that differ are refused before anything is computed.
+        # Different units are refused before anything is computed.
         records.units  # noqa: B018
         return records
 
 
 @dataclass(frozen=True)
 class FormatOptions:
-    """The form of what a command prints."""
+    """Form of a command's output."""
 
     format: Annotated[Format, flag("--format", "Output format.")] = "text"
     json: Annotated[bool, flag("--json", "Short for --format json.")] = False
 
     @property
     def form(self) -> Format:
-        """The form that is asked for."""
+        """Requested form."""
         return "json" if self.json else self.format

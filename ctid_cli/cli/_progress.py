@@ -1,4 +1,4 @@
-"""How a run looks on the terminal: a bar for people, a line now and then for log files."""
+"""Progress of a run on the terminal: a bar, or occasional lines in log files."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 
     from ctid_cli.running.engine import Progress as RunProgress
 
-#: Seconds between two lines where stderr is not a terminal.
+#: Seconds between two lines if stderr is not a terminal.
 LINE_EVERY = 10.0
-#: Seconds before the bar of a single record appears: most are done sooner.
+#: Seconds before the bar of a single record appears: most finish sooner.
 BAR_AFTER = 1.0
-#: Seconds before a fit shows how long it takes.
+#: Seconds before a fit shows its elapsed time.
 TIME_AFTER = 2.0
 
 
 class _Progress:
-    """A bar on stderr, from when it is started."""
+    """A bar on stderr, once it is started."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -61,7 +61,7 @@ class _Progress:
             self._bar.update(self._task, completed=done, **fields)
 
     def _is_time(self) -> bool:
-        """Whether a line is due where no bar is drawn."""
+        """Return whether a line is due if no bar is drawn."""
         return self._bar is None and time.monotonic() - self._last >= LINE_EVERY
 
     def _say(self, text: str) -> None:
@@ -74,7 +74,7 @@ class _Progress:
 
 
 class RecordProgress(_Progress):
-    """How far a record is done, or draws of its noise; nothing for what is done at once."""
+    """Progress over a record, or over draws of its noise; nothing is shown if it finishes at once."""
 
     def __init__(self, name: str, what: str = "the record") -> None:
         super().__init__(name)
@@ -93,7 +93,7 @@ class RecordProgress(_Progress):
 
 
 class FitProgress(RecordProgress):
-    """The time that a fit has taken, on a terminal and where it is not done at once; then the draws of a bootstrap."""
+    """Elapsed time of a fit, on a terminal and if it takes long; then the draws of a bootstrap."""
 
     def __init__(self, samples: int) -> None:
         super().__init__("bootstrap", "the draws")
@@ -134,11 +134,11 @@ class Reporter(_Progress):
     def __init__(self, name: str, *, quiet: bool = False) -> None:
         super().__init__(name)
         self._quiet = quiet
-        #: What was said first begins the run.
+        #: The first message marks the start of the run.
         self._ready = False
 
     def __call__(self, progress: RunProgress) -> None:
-        """Show how far the run is."""
+        """Show the progress of the run."""
         if self._quiet:
             return
         if progress.message:

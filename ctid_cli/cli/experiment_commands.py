@@ -1,4 +1,4 @@
-"""The commands about experiment files: ``ctid init``, ``validate``, ``accuracy``, ``run`` and ``schema``."""
+"""Commands on experiment files: ``ctid init``, ``validate``, ``accuracy``, ``run`` and ``schema``."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ if TYPE_CHECKING:
     from ctid_cli.storage.manifest import Shard
 
 
-#: Why a run ended early, in words; signals have their names.
+#: Reasons why a run ended early; signals have their names.
 _STOPPED = {
     "time budget": "stopped at the end of the time budget",
     "failures": "stopped because estimates failed, as was asked for",
     "machine": "stopped because the machine did not let estimates finish",
 }
-#: Changed settings that are named.
+#: Most changed settings that are listed.
 CHANGES = 3
 
 Dask = Annotated[
@@ -72,7 +72,7 @@ class Failure(StrEnum):
 
 @dataclass(frozen=True)
 class SpecOptions:
-    """How specifications are read."""
+    """Options for reading specifications."""
 
     overrides: Overrides = None
     allow_code: AllowCode = False
@@ -103,14 +103,14 @@ class SpecOptions:
         return plans
 
     def warn(self, plan: Plan) -> None:
-        """Print what is allowed in a specification but unwise."""
+        """Print warnings of a specification."""
         for warning in plan.spec.warnings:
             typer.echo(printable(f"warning: {warning}"), err=True)
 
 
 @dataclass(frozen=True)
 class PlaceOptions:
-    """Where results go, and what becomes of those that are there."""
+    """Folder of results, and treatment of existing ones."""
 
     out: Out = Path("results")
     fresh: Fresh = False
@@ -124,14 +124,14 @@ class PlaceOptions:
 
     @property
     def treatment(self) -> dict[str, Any]:
-        """What becomes of results that are there, as options of a run."""
+        """Treatment of existing results, as options of a run."""
         retry = [kind.upper() for kind in self.retry or ()]
         return {"fresh": self.fresh, "allow_mixed": self.allow_mixed, "retry": retry}
 
 
 @dataclass(frozen=True)
 class EndOptions:
-    """What ends a run early."""
+    """Conditions that end a run early."""
 
     max_failures: Annotated[int | None, flag("--max-failures", "Stop when N estimates have failed.", "N", min=1)] = None
     time_budget: Annotated[
@@ -172,7 +172,7 @@ def run(
         for plan, folder in zip(plans, folders, strict=True):
             typer.echo(f"{plan.experiment}: {_intention(preview(plan, folder, **place.treatment), folder)}")
         return
-    # What was imported stays: looking for garbage in it again and again would be a tenth of exporting many estimates.
+    # Imported objects stay: scanning them for garbage again and again takes a tenth of exporting many estimates.
     gc.freeze()
     summaries = _run_all(plans, folders, place, end, jobs=jobs, dask=dask, quiet=quiet, part=part)
     failed = [
@@ -200,7 +200,7 @@ def _run_all(
     part: Any,
     **how: Any,
 ) -> list[RunSummary]:
-    """Run one experiment after the other, as long as none ends early."""
+    """Run one experiment after the other, until one ends early."""
     from ctid_cli.running.engine import run_experiment
     from ctid_cli.running.limits import StopRequest
 
@@ -258,7 +258,7 @@ def _conclusion(summary: RunSummary, out: Path, part: Shard | None) -> str:
 
 
 def _changed(plan: Plan, summary: RunSummary) -> str:
-    """Name the settings that have changed since estimates were stored that are set aside; empty without any."""
+    """Return the settings that have changed since the estimates set aside were stored; empty if there are none."""
     from ctid_cli.reporting.results import differences
 
     if not summary.left_aside or summary.former is None:
@@ -280,7 +280,7 @@ def _changed(plan: Plan, summary: RunSummary) -> str:
 def validate(configs: Configs, spec: SpecOptions, form: FormatOptions) -> None:
     """Check experiment files without running them.
 
-    Prints every mistake with its place in the file, or how much work the experiment asks for.
+    Prints every mistake with its place in the file, or the amount of work of the experiment.
     """
     from ctid_cli.reporting.status_result import ValidationResult
 
@@ -288,7 +288,7 @@ def validate(configs: Configs, spec: SpecOptions, form: FormatOptions) -> None:
         section, sets = plan.spec.monte_carlo, plan.data_sets
         at_most = section.most if section is not None and section.until is not None else None
         cells, estimates = len(plan.data_cells), sets * plan.estimates_each
-        # Measured records, and signals, have no such field.
+        # Measured records and signals have no such field.
         noise_free = all(getattr(cell.source, "noise", True) is None for cell in plan.data_cells)
         warnings = list(plan.spec.warnings)
         emit(
@@ -325,10 +325,10 @@ def accuracy(
 
     No data are needed.
 
-    For every estimator and the swept numbers of samples: the standard error of each parameter by theory, with the
-    formula that it comes from. White Gaussian excitation on a regular clock has a limit for long records; otherwise
-    the sensitivities of the experiment's first data sets count. Where the experiment has results in OUT, what is
-    unexpected about them comes last.
+    For every estimator and the swept numbers of samples: the standard error of each parameter by theory, with its
+    formula. White Gaussian excitation on a regular clock has a limit for long records; otherwise the sensitivities of
+    the experiment's first data sets are used. If the experiment has results in OUT, their deviations from theory come
+    last.
     """
     from ctid_cli.reporting.accuracy_result import AccuracyResult
     from ctid_cli.reporting.results import find_results
@@ -337,8 +337,8 @@ def accuracy(
     emit(AccuracyResult.of(plan, find_results(out, plan.experiment)), form.form)
 
 
-#: Kinds of experiment files to begin with, each with what it is about and its files in the folder ``templates``; the
-#: first file is the specification, and its experiment has the name of the kind.
+#: Kinds of example experiment files, each with its subject and its files in the folder ``templates``; the first file is
+#: the specification, and its experiment has the name of the kind.
 TEMPLATES = {
     "open-loop": ("a system and its delay, found from noisy data", ["open-loop.yaml"]),
     "closed-loop": ("a system under a controller, with coloured noise", ["closed-loop.yaml"]),
@@ -357,7 +357,7 @@ def init(
 ) -> None:
     """Write commented experiment files to begin with.
 
-    They go into the current folder. Each runs as it is, in seconds, and says what every line of it means.
+    They go into the current folder. Each runs unchanged, in seconds, and explains every line.
     """
     wanted = kinds or list(TEMPLATES)
     for kind in wanted:

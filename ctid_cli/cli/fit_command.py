@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class WritingOptions:
-    """Which files ``ctid fit`` writes."""
+    """Files that ``ctid fit`` writes."""
 
     report: Annotated[bool, flag("--report", "Write the page fit.html too.")] = False
     csv: Annotated[Path | None, flag("--csv", "Write step, Bode, simulation and residuals as CSV.", "DIR")] = None
@@ -32,7 +32,7 @@ class WritingOptions:
     out: Annotated[Path, flag("--out", "Folder for fit.json and fit.svg.", "DIR")] = Path(".")
 
     def contents(self, result: FitResult, command: str) -> dict[Path, bytes]:
-        """Return what is written, by path; the first is the fit itself."""
+        """Return the contents of the files by path; the first is the fit itself."""
         from ctid_cli.reporting.column_file import frame_bytes
         from ctid_cli.reporting.fit_tables import fit_tables, model_code
 
@@ -50,7 +50,7 @@ class WritingOptions:
 
 @dataclass(frozen=True)
 class JudgingOptions:
-    """How the fit is judged."""
+    """Options for the assessment of the fit."""
 
     validate: Validate = None
     bootstrap: Annotated[
@@ -62,11 +62,11 @@ class JudgingOptions:
 
     @property
     def draws(self) -> dict[str, Any]:
-        """The intervals that are asked for, as options of a fit."""
+        """Requested intervals, as options of a fit."""
         return {} if self.bootstrap is None else {"covariance": "bootstrap", "bootstrap_draws": self.bootstrap}
 
     def check(self, noise: str, lengths: Mapping[str, int]) -> None:
-        """Refuse too few draws, predictions of white noise, and those farther ahead than a record is long."""
+        """Refuse too few draws, predictions of white noise, and horizons longer than a record."""
         from ctid_cli.estimation.common import LEAST_DRAWS
 
         if self.bootstrap is not None and self.bootstrap < LEAST_DRAWS:
@@ -96,10 +96,9 @@ def fit(
 ) -> None:
     """Fit a transfer function to records or a frequency response.
 
-    Prints the parameters with their standard errors and what tells whether to believe them, and writes fit.json and
-    fit.svg. Poles, zeros, integrators, the range of the delay, the hold of the input, and the treatment of state and
-    offset are chosen by one criterion where they are not given. A table of a frequency response, such as ctid frf
-    writes, needs --poles.
+    Prints the parameters with their standard errors and diagnostics, and writes fit.json and fit.svg. Poles, zeros,
+    integrators, the range of the delay, the hold of the input, and the treatment of state and offset are chosen by one
+    criterion unless they are given. A table of a frequency response, such as ctid frf writes, needs --poles.
     """
     asked = Asked(model, treatment, loop.use, columns.names)
     read = [*files, *([judging.validate] if judging.validate else [])]
@@ -117,7 +116,7 @@ def fit(
 def _fit_of_records(
     files: list[Path], asked: Asked, loop: LoopOptions, columns: RecordOptions, judging: JudgingOptions
 ) -> FitResult:
-    """Fit a model to records in time, with a bar of progress where it takes long."""
+    """Fit a model to records in time, with a progress bar if it takes long."""
     from ctid_cli.identification.identify import identify
     from ctid_cli.reporting.fit_result import FitResult
 

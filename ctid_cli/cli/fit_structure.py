@@ -1,4 +1,4 @@
-"""Options of ``ctid fit`` and ``ctid order`` that say what the model is, and the estimator that they ask for."""
+"""Options of ``ctid fit`` and ``ctid order`` for the model, and the estimator that follows from them."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from ctid_cli.models.additive import Term
     from ctid_cli.signals.measurement import Measurement
 
-#: What of a loop an estimate is made with: nothing, its reference as an instrument, or reference and controller.
+#: What is known of a loop: nothing, its reference as an instrument, or reference and controller.
 LoopUse = Literal["none", "reference", "controller"]
-#: A loop whose controller is not known.
+#: A loop with an unknown controller.
 UNKNOWN = "unknown"
 DIRECT = (
     "The model is fitted to the input as it was measured in the loop (direct method): that is right only if the noise "
@@ -38,7 +38,7 @@ DIRECT = (
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]
 FormOption = Annotated[ModelForm, flag("--model", "One transfer function, or a sum of submodels.")]
-#: Numbers of second-order submodels that a sum is chosen from.
+#: Numbers of second-order submodels among which a sum is chosen.
 MODES = 1, 6
 HoldOption = Annotated[AskedHold, flag("--hold", "Input between its samples; else chosen.")]
 
@@ -47,7 +47,7 @@ HoldOption = Annotated[AskedHold, flag("--hold", "Input between its samples; els
 
 
 def delay_range(text: str) -> tuple[float, float]:
-    """Read a range of the delay; a known one is one value, which is both ends."""
+    """Read a range of the delay; a single value is a known delay."""
     bounds = span(text, float)
     if bounds is not None and 0 <= bounds[0] <= bounds[1] < float("inf"):
         return bounds
@@ -56,7 +56,7 @@ def delay_range(text: str) -> tuple[float, float]:
 
 
 def read_hold(text: str) -> AskedHold:
-    """Read how an input behaves between its samples."""
+    """Read the hold of an input."""
     if text in get_args(AskedHold):
         return cast(AskedHold, text)
     allowed = f"{', '.join(get_args(AskedHold))}, or INPUT=HOLD for one of several inputs"
@@ -64,7 +64,7 @@ def read_hold(text: str) -> AskedHold:
 
 
 def per_input(option: str, given: Sequence[str] | None) -> dict[str, Any]:
-    """Read an option that is given for single inputs, INPUT=VALUE, or for all: that is the value without a name."""
+    """Read an option given for single inputs, INPUT=VALUE, or for all, as a value without a name."""
     found: dict[str, Any] = {}
     for text in given or ():
         name, _, value = (part.strip() for part in text.rpartition("="))
@@ -78,7 +78,7 @@ def per_input(option: str, given: Sequence[str] | None) -> dict[str, Any]:
     return found
 
 
-#: Options that single inputs may have, and how their values are read.
+#: Options that can be given for single inputs, and how their values are read.
 OF_INPUTS: dict[str, Callable[[str], Any]] = {
     "--poles": int,
     "--zeros": int,
@@ -103,12 +103,12 @@ class StructureOptions:
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Range of the delay, a known one twice; None where it is not given for all inputs."""
+        """Range of the delay, a known one twice; None if it is not given for all inputs."""
         return per_input("--delay", self.delays).get("")
 
     @property
     def integrators(self) -> int | None:
-        """Poles at the origin; None where they are not given for all inputs."""
+        """Poles at the origin; None if they are not given for all inputs."""
         return per_input("--integrators", self.each_integrators).get("")
 
 
@@ -126,7 +126,7 @@ class TreatmentOptions:
 
     @property
     def level(self) -> InputBefore:
-        """The input before the first sample; None where it is not given."""
+        """Input before the first sample; None if it is not given."""
         if self.input_before is None or self.input_before == "first":
             return "first" if self.input_before else None
         try:
@@ -137,7 +137,7 @@ class TreatmentOptions:
 
 @dataclass(frozen=True)
 class ModelOptions(StructureOptions):
-    """What the model is: one transfer function or a sum of submodels, its degrees, delay, and known parameters."""
+    """Model: one transfer function or a sum of submodels, its degrees, delay, and known parameters."""
 
     each_poles: Annotated[
         list[str] | None,
@@ -193,7 +193,7 @@ class ModelOptions(StructureOptions):
 
     @property
     def submodels(self) -> tuple[Term, ...]:
-        """The terms of a sum, such as ``2/0,2/1``, or the one fraction; integrators belong to the first."""
+        """Terms of a sum, such as ``2/0,2/1``, or one transfer function; integrators belong to the first."""
         from ctid_cli.models.additive import Term
 
         parts = f"{self.poles}/{self.zeros or 0}" if self.terms is None else self.terms
@@ -208,18 +208,18 @@ class ModelOptions(StructureOptions):
 
     @property
     def poles(self) -> int | None:
-        """Number of poles; None where it is not given for all inputs."""
+        """Number of poles; None if it is not given for all inputs."""
         return per_input("--poles", self.each_poles).get("")
 
     @property
     def zeros(self) -> int | None:
-        """Number of zeros; None where it is not given for all inputs."""
+        """Number of zeros; None if it is not given for all inputs."""
         return per_input("--zeros", self.each_zeros).get("")
 
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """The loop that a record was taken in."""
+    """Loop in which a record was taken."""
 
     loop: Annotated[
         str | None, flag("--loop", "YAML with the section loop of the record, if it is known.", "FILE|unknown")
@@ -231,20 +231,20 @@ class LoopOptions:
 
     @property
     def use(self) -> LoopUse:
-        """What of the loop an estimate is made with."""
+        """What is known of the loop."""
         if self.direct or (self.loop in (None, UNKNOWN) and self.reference is None):
             return "none"
         return "reference" if self.loop in (None, UNKNOWN) else "controller"
 
     @cached_property
     def known(self) -> Any:
-        """The loop of the file; None where there is none."""
+        """Loop of the file; None if there is none."""
         from ctid_cli.specification.load import load_loop
 
         return None if self.loop in (None, UNKNOWN) else load_loop(Path(self.loop or ""))
 
     def check(self) -> None:
-        """Refuse half of what a loop needs, and a file that is none."""
+        """Refuse incomplete loop options, and a file that contains no loop."""
         if self.direct and self.loop is None:
             raise UsageError(
                 "--direct says how a record in a loop is fitted; add --loop FILE or --loop unknown, or drop it"
@@ -255,7 +255,7 @@ class LoopOptions:
             )
 
     def applied(self, measured: Measurement) -> Measurement:
-        """Return a measurement in its loop, or with a note on what the direct method asks for."""
+        """Return a measurement in its loop, or with a note on the needs of the direct method."""
         if self.loop is None and self.reference is None:
             return measured
         from ctid_cli.simulation.record_loop import in_loop, in_unknown_loop
@@ -269,7 +269,7 @@ class LoopOptions:
 
 @dataclass(frozen=True)
 class FitOptions(TreatmentOptions):
-    """Treatment of the initial state and of offsets, of large errors, and of the input between its samples."""
+    """Treatment of the initial state, of offsets, of large errors, and hold of the input."""
 
     loss: Annotated[LossKind | None, flag("--loss", "Loss function of the output errors.")] = None
     noise: Annotated[str, flag("--noise", "Noise that is estimated with the model.", "white|arma:P,Q|auto")] = "white"
@@ -287,25 +287,25 @@ class FitOptions(TreatmentOptions):
 
 @dataclass(frozen=True)
 class Asked:
-    """What the command line says of the model."""
+    """Options of the model on the command line."""
 
     model: ModelOptions
     treatment: FitOptions
-    #: What of the loop that the record was taken in counts.
+    #: What is known of the loop in which the record was taken.
     loop: LoopUse = "none"
     #: Names of several inputs, else empty.
     inputs: tuple[str, ...] = ()
 
     @property
     def each(self) -> dict[str, dict[str, Any]]:
-        """What is given of single inputs, and of all, by option."""
+        """Values given for single inputs, and for all, by option."""
         model = self.model
         texts = model.each_poles, model.each_zeros, model.delays, model.each_integrators, self.treatment.each_hold
         return {option: per_input(option, given) for option, given in zip(OF_INPUTS, texts, strict=True)}
 
     @property
     def hold(self) -> AskedHold | tuple[Hold, ...]:
-        """How the inputs behave between their samples; where one is given by itself, that of each."""
+        """Hold of the inputs; if it is given for single ones, that of each."""
         given = self.each["--hold"]
         if not {*given} - {""}:
             return cast(AskedHold, given.get("", "auto"))
@@ -321,7 +321,7 @@ class Asked:
 
     @property
     def iterated(self) -> bool:
-        """Whether the estimator is that with instruments from the loop, which knows the delay."""
+        """Whether the estimator uses instruments from the loop, and needs a known delay."""
         return self.loop == "reference" or (self.model.model == "additive" and self.loop == "controller")
 
     @property
@@ -332,7 +332,7 @@ class Asked:
 
 @contextlib.contextmanager
 def as_usage_errors() -> Iterator[None]:
-    """Turn what options of an estimator refuse into a message about the command line."""
+    """Turn errors about options of an estimator into a message about the command line."""
     try:
         yield
     except ValueError as error:
@@ -340,7 +340,7 @@ def as_usage_errors() -> Iterator[None]:
 
 
 def options_of(asked: Asked) -> AdditiveOutputError | MeasuredSubmodels | LoopOutputError | Given:
-    """Return the estimator, or what of it is given; a UsageError says which options do not go together."""
+    """Return the estimator, or the given options of a choice; a UsageError names contradicting options."""
     from ctid_cli.estimators.additive_output_error import AdditiveOutputError
     from ctid_cli.estimators.loop_output_error import LoopOutputError
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
@@ -386,7 +386,7 @@ def _degrees(model: ModelOptions) -> str:
 
 
 def with_delays(model: ModelOptions, inputs: Sequence[str]) -> ModelOptions:
-    """Return the options with what ``--fix`` and ``--bound`` say of delays among those of ``--delay``."""
+    """Return the options with the delays of ``--fix`` and ``--bound`` among those of ``--delay``."""
     delays = tuple(f"{name}_delay=" for name in inputs)
     known = [text for text in model.fix or () if delays and text.startswith(delays)]
     ranges = [text for text in model.bound or () if text.startswith(("delay=", *delays))]
@@ -402,7 +402,7 @@ def with_delays(model: ModelOptions, inputs: Sequence[str]) -> ModelOptions:
 
 
 def _given(asked: Asked) -> Given:
-    """Return what is given of the choice, and of each of several inputs; its delay may be known by ``--fix`` too."""
+    """Return the given options of the choice, and of each of several inputs; ``--fix`` may give a delay too."""
     treatment = asked.treatment
     model = with_delays(asked.model, asked.inputs)
     bounds = model.parameter_bounds
@@ -414,7 +414,7 @@ def _given(asked: Asked) -> Given:
     for option, needed in needing.items():
         if needed and poles is None:
             raise UsageError(f"{_degrees(model)} is missing: with {option} it must be given")
-    # The names of known parameters are those of a number of zeros.
+    # The names of known parameters depend on the number of zeros.
     zeros = 0 if model.zeros is None and (model.fix or bounds or own_poles or own_zeros) else model.zeros
     given = replace(given_of(model, treatment, asked.hold), poles=poles, zeros=zeros, fixed=model.fixed, bounds=bounds)
     if model.model == "additive":
@@ -423,7 +423,7 @@ def _given(asked: Asked) -> Given:
 
 
 def given_of(structure: StructureOptions, treatment: TreatmentOptions, hold: AskedHold | tuple[Hold, ...]) -> Given:
-    """Return what is given of the choice."""
+    """Return the given options of the choice."""
     from ctid_cli.identification.choice import Given
 
     if structure.integrators is not None:
@@ -439,7 +439,7 @@ def given_of(structure: StructureOptions, treatment: TreatmentOptions, hold: Ask
 
 
 def inputs_of(asked: Asked) -> tuple[InputModel, ...] | None:
-    """Return what is given of each of several inputs."""
+    """Return the given options of each of several inputs."""
     from ctid_cli.estimators.delay_profile import InputModel
 
     if not asked.inputs:
@@ -457,7 +457,7 @@ def inputs_of(asked: Asked) -> tuple[InputModel, ...] | None:
 
 
 def _refuse_inputs(asked: Asked) -> None:
-    """Options of single inputs that the record does not have, and what is not available for several."""
+    """Refuse options of inputs that the record does not have, and those not available for several."""
     for option, values in asked.each.items():
         for name in {*values} - {"", *asked.inputs}:
             named = f"the inputs are {', '.join(asked.inputs)}" if asked.inputs else "name several with --input"
@@ -473,7 +473,7 @@ def _refuse_inputs(asked: Asked) -> None:
 
 
 def check_integrators(integrators: int, offset: Offset, instead: str = "--offset") -> None:
-    """Refuse numbers of integrators, and what they make of a mean; a constant is estimated by another option."""
+    """Refuse invalid numbers of integrators, and a mean with integrators; another option estimates a constant."""
     from ctid_cli.estimation.common import MOST_INTEGRATORS
 
     if not 0 <= integrators <= MOST_INTEGRATORS:
@@ -487,7 +487,7 @@ def check_integrators(integrators: int, offset: Offset, instead: str = "--offset
 
 
 def _refuse_other_form(asked: Asked) -> None:
-    """Options of one form of the model beside those of the other."""
+    """Refuse options of one form of the model with those of the other."""
     model = asked.model
     if model.model == "additive":
         for name, value in (("--poles", model.poles), ("--zeros", model.zeros)):
@@ -502,14 +502,14 @@ def _refuse_other_form(asked: Asked) -> None:
 
 
 def _what(asked: Asked) -> str:
-    """Return what an estimator of one record is for."""
+    """Return the purpose of an estimator of one record."""
     if asked.loop == "reference":
         return "the reference as an instrument"
     return "a record in a loop" if asked.simulated else "a sum of submodels in a loop"
 
 
 def _unavailable(asked: Asked) -> Iterator[tuple[bool, str, str]]:
-    """Yield what submodels and simulated loops cannot do: whether it is asked for, the option, and a remedy."""
+    """Yield what submodels and simulated loops do not support: whether it is requested, the option, and a remedy."""
     model, treatment = asked.model, asked.treatment
     state, offset, hold = treatment.initial_state, treatment.offset, asked.hold
     low, high = model.bounds or (0.0, 0.0)

@@ -16,7 +16,7 @@ from ctid_cli.cli.reproduce_command import reproduce
 from ctid_cli.cli.result_commands import export, merge, status, table, verify
 from ctid_cli.cli.track_command import track
 
-# Plain help and error texts: they read well in log files, and leave rich out of the start-up.
+# Plain help and error texts are readable in log files, and avoid importing rich.
 app = typer.Typer(
     name="ctid",
     no_args_is_help=True,
@@ -48,7 +48,7 @@ def _root(
     """
 
 
-# What shows or moves stored results must not wait for Numba to be loaded.
+# Commands that show or move stored results do not wait for Numba.
 _STORED = (status, export, verify, merge, init)
 _RESULTS = (status, table, figure, report, export, verify)
 _RECORDS = (check, fit, compare, order, frf, track)
@@ -57,8 +57,8 @@ for _command in (*_RECORDS, init, run, reproduce, merge, *_RESULTS, validate, ac
 
 
 def main() -> None:
-    """Entry point of the ``ctid`` command."""
-    # The matrices are small: threads for one product would only wait for each other. NumPy is not loaded yet.
+    """Run the ``ctid`` command."""
+    # The matrices are small, so more threads for a product only slow it down. NumPy is not loaded yet.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     app(prog_name="ctid")
 

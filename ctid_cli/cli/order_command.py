@@ -45,9 +45,9 @@ def order(
 ) -> None:
     """Show the structures that ctid fit chooses from.
 
-    Fits structures with ever more poles until the best lies inside, ranks them by the criterion that ctid fit uses, and
-    marks the one that it takes; or says that there is no model here. With --model additive structures are sums of ever
-    more second-order submodels. Writes order.json and order.svg.
+    Fits structures with increasing numbers of poles until the best lies inside the grid, ranks them by the criterion of
+    ctid fit, and marks the chosen one; or states that there is no model. With --model additive structures are sums of
+    second-order submodels. Writes order.json and order.svg.
     """
     from ctid_cli.identification.choose import choose
     from ctid_cli.reporting.order_result import OrderSearchResult

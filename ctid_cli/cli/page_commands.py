@@ -1,4 +1,4 @@
-"""``ctid figure`` and ``ctid report``: results as drawings and as pages."""
+"""``ctid figure`` and ``ctid report``: figures and pages of results."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def figure(
     """Draw figures of experiments and of studies.
 
     Of an experiment: measure, a percentage or another measure over all that was swept; box, the errors of each
-    parameter. Both with 95 % intervals; without --kind the one that tells most. It goes to OUT/<experiment>/figures,
+    parameter. Both with 95 % intervals; without --kind the most informative one. It goes to OUT/<experiment>/figures,
     and its path is printed.
 
     Of a study, as SVG: most are computed from the study's specifications and need no results: all of useful-redundancy,
@@ -60,7 +60,7 @@ def figure(
 def _draw_experiment(
     name: str, out: Path, file: Path | None, style: Form | None, chosen: tuple[str | None, str | None, str | None]
 ) -> None:
-    """Draw a figure of an experiment; the name of its file says which it is."""
+    """Draw a figure of an experiment, to a file named after its kind."""
     from ctid_cli.reporting.figures.experiment_plot import chosen_kind, experiment_drawing
     from ctid_cli.reporting.results import read_results
 
@@ -80,7 +80,7 @@ def _form_of(file: Path | None) -> Form:
 
 
 def _write(content: bytes, usual: Path, out: Path, file: Path | None) -> None:
-    """Write a file to its usual place within the results folder, or where the user says, and print its path."""
+    """Write a file to its default place in the results folder, or to the user's path, and print its path."""
     path = usual if file is None else file
     write_files({path: content}, out if file is None else None)
     typer.echo(path)
@@ -108,11 +108,10 @@ def report(
 ) -> None:
     """Write a page about a fit, a track, an experiment or a study.
 
-    To read, print or send: one HTML file that opens anywhere and loads nothing. Of a fit: data, model, what it
-    does, its residuals, and what to know before using it. Of a track: the signal, its spectrogram, its tones, and
-    the spectrum of what these leave. Of an experiment or study: the question, tables, figures, differences of the
-    estimators on the same data sets, what went wrong and the commands that show it, how all of it was computed. And
-    how to cite it.
+    One self-contained HTML file, to read, print or send. For a fit: data, model, responses, residuals, and warnings.
+    For a track: the signal, its spectrogram, its tones, and the spectrum of the residual. For an experiment or study:
+    the question, tables, figures, differences of the estimators on the same data sets, failures with the commands that
+    show them, and provenance. Also how to cite it.
     """
     path = Path(name)
     if path.suffix.lower() == ".json" or path.is_file():
@@ -130,7 +129,7 @@ def report(
 
 
 def _page_of_file(path: Path, records: list[Path], validate: Path | None) -> str:
-    """Return the page of a fit or a track, of which the file says which it is."""
+    """Return the page of a fit or a track, whose file contains its kind."""
     from ctid_cli.reporting.fit_result import FitResult
     from ctid_cli.reporting.records import Records
     from ctid_cli.reporting.track_result import TrackResult

@@ -1,4 +1,4 @@
-"""``ctid check``, ``ctid compare`` and ``ctid frf``: what a record shows, alone and of models."""
+"""``ctid check``, ``ctid compare`` and ``ctid frf``: records alone, and compared with models."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def check(
     """State facts on a measured record, and the fit to begin with.
 
     Clock, gaps, input, saturation, outliers; signal-to-noise ratio, response time, delay; offset, drift, start from
-    rest and feedback, tested beside the response to the input in noise of any colour. Columns are found by their usual
+    rest and feedback, tested with the response to the input in noise of any colour. Columns are found by their usual
     names (t, u, y) unless named.
     """
     from ctid_cli.identification.choice import Given
@@ -51,7 +51,7 @@ def check(
 
 
 def command_of(measured: Measurement, chosen: Sequence[str]) -> str:
-    """Return the fit of a record by what was chosen, with the columns and the part that were asked for."""
+    """Return the fit of a record with the chosen options, and the requested columns and part."""
     from ctid_cli.signals.table import ROLES, USUAL_NAMES, split_header
 
     words = ["ctid", "fit", measured.record.name]
@@ -98,7 +98,7 @@ def compare(
 
 
 def _record(fit: StoredFit, file: Path, columns: RecordOptions, hold: Hold | None) -> Measurement:
-    """Read a record: by the column names of the fit where the file has them and none are named."""
+    """Read a record, with the column names of the fit if the file has them and none are given."""
     from ctid_cli.signals.measurement import open_table
 
     own = fit.content["records"][0]["columns"]
@@ -137,9 +137,9 @@ def frf(
 ) -> None:
     """Estimate the frequency response of measured records.
 
-    No model is fitted. An input that repeats itself is averaged over its periods, which gives the variance by the
-    noise and, from lines without input or from several records, the level of nonlinear distortions. Any other
-    record is taken by local polynomials. Writes frf.csv and frf.svg.
+    No model is fitted. A periodic input is averaged over its periods, which gives the variance of the noise and,
+    from lines without input or from several records, the level of nonlinear distortions. Other records are analysed by
+    local polynomials. Writes frf.csv and frf.svg.
     """
     from ctid_cli.inference.frequency_response import estimate_frequency_response
     from ctid_cli.reporting.column_file import frame_bytes
@@ -163,7 +163,7 @@ def frf(
 
 
 def _method(method: ResponseMethod, period: int | None, width: int | None, segment: int | None) -> ResponseMethod:
-    """Return the method that the options belong to, and refuse those of two methods."""
+    """Return the method of the given options, and refuse those of two methods."""
     values: dict[ResponseMethod, int | None] = {"periodic": period, "local-polynomial": width, "welch": segment}
     owners = [owner for owner, value in values.items() if value is not None]
     for owner in owners:

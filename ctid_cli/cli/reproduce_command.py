@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Actions:
-    """What is done instead of running the studies; one at a time."""
+    """Actions in place of running the studies; one at a time."""
 
     list: Annotated[bool, flag("--list", "List the studies with their experiments.")] = False
     check: Annotated[bool, flag("--check", "Test the claims, and compare the tables with those committed.")] = False
@@ -48,10 +48,10 @@ class Actions:
 
 @dataclass(frozen=True)
 class PublishedSpecs(SpecOptions):
-    """Specifications of studies, in which what is unwise is on purpose."""
+    """Specifications of studies, whose warnings are not shown."""
 
     def warn(self, plan: Plan) -> None:
-        """Say nothing."""
+        """Print nothing."""
 
 
 @guarded
@@ -95,7 +95,7 @@ def reproduce(
 
 
 def _require_whole(studies: Sequence[Study]) -> None:
-    """Refuse some experiments of a study where only the whole study can be published or compared."""
+    """Refuse a part of a study if only the whole study can be published or compared."""
     from ctid_cli.reporting.study import find_study
 
     for study in studies:
@@ -131,7 +131,7 @@ def _check(studies: Sequence[Study], out: Path, form: FormatOptions) -> None:
 
 
 def _publish(studies: Sequence[Study], out: Path) -> None:
-    """Publish studies, also those of which a claim does not hold."""
+    """Publish studies, also with claims that do not hold."""
     from ctid_cli.studies.catalogue import read_study
     from ctid_cli.studies.claims import check_claims
     from ctid_cli.studies.publishing import publish
@@ -147,7 +147,7 @@ def _publish(studies: Sequence[Study], out: Path) -> None:
 
 
 def _compute_first(studies: Sequence[Study], jobs: int | None, *, update: bool) -> None:
-    """Compute the first data sets of studies, and compare them with those committed or commit to them."""
+    """Compute the first data sets of studies, and compare them with the committed ones or replace those."""
     from ctid_cli.studies.first_estimates import compare, compute_first, read_first, write_first
 
     wrong = 0

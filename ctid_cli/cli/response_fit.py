@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def frequency_files(files: Sequence[Path]) -> list[Path]:
-    """Return which files are tables of frequency responses; what is wrong with others is told where they are read."""
+    """Return the files that are tables of frequency responses; errors in others are reported when they are read."""
     from ctid_cli.errors import DataError
     from ctid_cli.signals.frequency_data import is_frequency_table
 
@@ -32,7 +32,7 @@ def frequency_files(files: Sequence[Path]) -> list[Path]:
 def frequency_fit(
     files: Sequence[Path], asked: Asked, loop: LoopOptions, columns: RecordOptions, others: dict[str, object]
 ) -> FrequencyFitResult:
-    """Fit a model to the one frequency response that is given; a UsageError where options do not go with one."""
+    """Fit a model to the given frequency response; a UsageError for options that do not apply to one."""
     from ctid_cli.estimators.frequency_domain import FrequencyDomain
     from ctid_cli.identification.identify_response import identify_frequency_response
     from ctid_cli.reporting.frequency_fit import FrequencyFitResult
@@ -68,7 +68,7 @@ def frequency_fit(
 def _of_records(
     asked: Asked, loop: LoopOptions, columns: RecordOptions, others: dict[str, object]
 ) -> Iterator[tuple[str, str]]:
-    """Yield options that only a record has a meaning for, and why."""
+    """Yield options that apply only to records, and why."""
     treatment = asked.treatment
     rest, noise = "its system is at rest", "lines have weights, and no noise model over time"
     options = {

@@ -1,4 +1,4 @@
-"""The commands about stored results: ``ctid status``, ``table``, ``export``, ``merge`` and ``verify``."""
+"""Commands on stored results: ``ctid status``, ``table``, ``export``, ``merge`` and ``verify``."""
 
 from pathlib import Path
 from typing import Annotated
@@ -35,7 +35,7 @@ def status(
         read_results(out, experiment)
     one = experiment_status(out / experiment)
     if not one.done:
-        # A first run that is still going on has nothing to read yet.
+        # An unfinished first run has nothing to read yet.
         emit(StatusResult(one, out), form.form)
         return
     results = read_results(out, experiment)
@@ -70,8 +70,8 @@ def table(
     frequency [rad/s]. An experiment without a success rule shows bias and rmse, or what `measures` of its specification
     names.
 
-    Without a name: all tables of the useful-redundancy study. Cells that were not run say so; where the folder results
-    holds nothing of a table, as in a fresh clone, the committed results are printed.
+    Without a name: all tables of the useful-redundancy study. Cells that were not run say so; if the folder results
+    contains nothing of a table, as in a fresh clone, the committed results are printed.
     """
     from ctid_cli.reporting.paired_result import compare_estimators
     from ctid_cli.reporting.study_table import build_tables, experiments
@@ -88,7 +88,7 @@ def table(
         measures = measure.split(",") if measure is not None else ()
         result = build_tables(names or [], out, committed=out == Path("results"), measures=measures)
     emit(result, form.form)
-    # Text, Markdown and LaTeX hold the remarks themselves.
+    # Text, Markdown and LaTeX contain the remarks themselves.
     for remark in result.remarks if form.form in ("csv", "json") else ():
         typer.echo(f"ctid: {remark}", err=True)
 
@@ -140,7 +140,7 @@ def _export_fit(path: Path, tool: Tool | None, pade: int | None, file: Path | No
 
 
 def _export_all(experiment: str, form: Format, out: Path, file: Path | None) -> None:
-    """Write every estimate, piece by piece, however many there are."""
+    """Write every estimate, in parts of limited size."""
     from ctid_cli.reporting.results import read_results
     from ctid_cli.storage.estimates import csv_lines, json_lines
 
@@ -179,8 +179,8 @@ def merge(
 ) -> None:
     """Merge the shards of experiments into one folder of results.
 
-    `ctid run --shard K/N` computes one of N shards. Merged in whatever order, they give the runs.h5 of a single run,
-    byte for byte. The folders of the shards stay as they are.
+    `ctid run --shard K/N` computes one of N shards. Merged in any order, they give the runs.h5 of a single run,
+    byte for byte. The folders of the shards are not changed.
     """
     from ctid_cli.reporting.status_result import MergeResult
     from ctid_cli.storage.merge import find_sources, merge_all

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SignalOptions:
-    """Which column and which part of a recorded signal is used, and its clock."""
+    """Column and part of a recorded signal to use, and its clock."""
 
     time: TimeColumn = None
     signal: Annotated[str | None, flag("--signal", "Column or channel to use.", "NAME")] = None
@@ -31,7 +31,7 @@ class SignalOptions:
     stop: To = None
 
     def reading(self) -> Reading:
-        """Return how the signal is read from its file."""
+        """Return the options for reading the signal from its file."""
         from ctid_cli.storage.track_file import Reading
 
         if self.interval is not None and self.rate is not None:
@@ -42,7 +42,7 @@ class SignalOptions:
 
 @dataclass(frozen=True)
 class ToneOptions:
-    """How tones are followed; None where it is chosen from the record."""
+    """Options for following tones; what is None is chosen from the record."""
 
     tones: Annotated[str, flag("--tones", "Number of sinusoids, or auto.", "N")] = "auto"
     every: Annotated[
@@ -83,9 +83,9 @@ def track(
 ) -> None:
     """Follow the frequencies of a recorded sum of sinusoids.
 
-    Prints the frequency of each tone, how well it is known, how far it moves, and for how much of the time it can be
-    trusted; writes everything over time to track.csv (or track.h5), track.svg and track.json, which ctid report makes
-    a page of. All the rest is chosen from the record, and printed.
+    Prints the frequency of each tone, its standard error, its variation, and the share of time in which it is valid;
+    writes all values over time to track.csv (or track.h5), track.svg and track.json, from which ctid report makes a
+    page. Other settings are chosen from the record, and printed.
     """
     reading = part.reading()
     written = [out / f"track.{'h5' if hdf5 else 'csv'}", out / "track.svg", out / "track.json"]
@@ -109,7 +109,7 @@ def track(
 
 
 def _require_part(record: SampledSignal, reading: Reading) -> None:
-    """Refuse a part that is too short, which is often one in another unit of time."""
+    """Refuse a part that is too short, often because of another unit of time."""
     from ctid_cli.tones.constants import FEWEST
 
     if record.samples.size < FEWEST and not (reading.start is None and reading.stop is None):

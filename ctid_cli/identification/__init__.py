@@ -1,1 +1,1 @@
-"""From records to a model: what is not given is chosen by one criterion, and remedies are tried."""
+"""Fit of a model to records: what is not given is chosen by one criterion, and remedies are tried."""

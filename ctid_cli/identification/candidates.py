@@ -1,4 +1,4 @@
-"""Fits of many structures to the same records, each found from the smaller ones that it contains."""
+"""Fits of many structures to the same records, each started from smaller structures that it contains."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,19 +24,19 @@ from ctid_cli.signals.treatment import Holds, InitialState, InputBefore, Offset
 MOST_POLES = 12
 #: The grid ends this many poles above the order of the best structure, and at this order at the least.
 BEYOND, FEWEST_TRIED = 2, 4
-#: It ends at this order at the least while each more pole pays even if the rest is taken as white noise: what the
-#: closest fit misses of the response would pass as coloured noise.
+#: Least order of that end while an added pole lowers the criterion even in white noise: otherwise the part of the
+#: response that the closest fit misses would pass as coloured noise.
 TRIED_AGAINST_NOISE = 6
-#: From then on a number of integrators whose best structure is so far behind is left out.
+#: From then on a number of integrators is dropped if its best structure is this far behind.
 BEHIND = 30.0
-#: All poles and zeros of the structures that settings of records are compared with.
+#: Poles (integrators included) and zeros of the structures with which settings of records are compared.
 SMALL = ((1, 0), (2, 1), (3, 2))
-#: Samples for each parameter of a structure at least.
+#: Fewest samples for each parameter of a structure.
 SAMPLES_PER_PARAMETER = 3
 
 
 class Setting(NamedTuple):
-    """How records are taken."""
+    """Treatment of records."""
 
     hold: Holds
     initial_state: InitialState
@@ -45,28 +45,28 @@ class Setting(NamedTuple):
 
     @property
     def state(self) -> tuple[InitialState, InputBefore]:
-        """The state before the records."""
+        """State before the records."""
         return self.initial_state, self.input_before
 
 
 class Several(NamedTuple):
-    """What is known of several inputs, which share a denominator."""
+    """Options of several inputs, which share a denominator."""
 
     #: Given ranges of their delays.
     inputs: tuple[InputModel, ...] | None = None
     #: Whether each may have fewer zeros than the structure.
     fewer_zeros: bool = True
-    #: Delays of a small model.
+    #: Delays of a small model, from which searches start.
     first_delays: tuple[float, ...] | None = None
 
 
 class Span(NamedTuple):
-    """Least and greatest number of poles (integrators not among them) and of zeros, and the numbers of integrators."""
+    """Ranges of the numbers of poles (without integrators) and zeros, and the numbers of integrators."""
 
     poles: tuple[int, int] = (0, MOST_POLES)
     zeros: tuple[int, int] = (0, MOST_POLES)
     integrators: tuple[int, ...] = (0, 1)
-    #: Least and greatest number of second-order submodels, where models are sums of these.
+    #: Range of the number of second-order submodels, if models are sums of these.
     modes: tuple[int, int] | None = None
 
     @classmethod
@@ -88,7 +88,7 @@ class Span(NamedTuple):
                 yield poles, zeros
 
     def small(self, integrators: int, delay_free: bool, most: int) -> list[tuple[int, int]]:
-        """Return the structures that settings of records are compared with: small ones, or else the smallest."""
+        """Return small structures with which settings are compared; the smallest one if none is small."""
         orders = range(1, MOST_POLES + max(self.integrators) + 1)
         found = [(n, each) for n in orders for each in self.structures(n, integrators, delay_free)]
         small = [each for n, each in found if (n, each[1]) in SMALL[:most]]
@@ -129,7 +129,7 @@ class Structures:
         near: Callable[[int, int], AnyModel | None] | None = None,
         several: "Several | None" = None,
     ) -> "Structures":
-        """Lay records out."""
+        """Prepare records."""
         hold, state, before, offset = setting
         least, several = int(not integrators), several or Several()
         options = DelayProfile(
@@ -142,7 +142,7 @@ class Structures:
         )
         held = [with_hold(record, hold) for record in records]
         measured = options.prepare(held).laid_out
-        # One box for all: a wider one for those at rest would favour them.
+        # One box for all settings: a wider one for records at rest would favour rest.
         box = box_of(measured.problem._replace(free_response=state != "periodic"), measured.treatment.delay_bounds)
         search = StructureSearch(measured.problem, box, effort=QUICK, first_delays=several.first_delays)
         return cls(held, hold, options, measured, search, near, several.fewer_zeros)
@@ -153,7 +153,7 @@ class Structures:
         return [self.fit(*structure) for structure in structures]
 
     def fit(self, poles: int, zeros: int) -> Candidate | None:
-        """Fit a structure; None where there are too few samples."""
+        """Fit a structure; return None if there are too few samples."""
         if (poles, zeros) not in self.found:
             options, measured = replace(self.options, poles=poles, zeros=zeros), self.measured
             laid_out = measured.with_degrees(options.order, [zeros] * len(measured.degrees.inputs))
@@ -166,7 +166,7 @@ class Structures:
         return self.found[poles, zeros]
 
     def _with_fewer_zeros(self, candidate: Candidate) -> Candidate:
-        """Return a candidate whose inputs have only the zeros that are worth their parameters, in white noise."""
+        """Remove the zeros of each input that do not lower the criterion in white noise."""
         names = self.measured.degrees.inputs
         zeros = [candidate.options.zeros] * len(names)
         if candidate.fit.poles_at_infinity or len(names) < 2:
@@ -182,7 +182,7 @@ class Structures:
         return candidate
 
     def _near(self, candidate: Candidate, zeros: Sequence[int]) -> Candidate:
-        """Fit numerators of other degrees near a candidate."""
+        """Fit numerators of other degrees, starting at a candidate."""
         assert isinstance(candidate.options, DelayProfile)
         own = {one.name: one for one in candidate.options.inputs or ()}
         names = self.measured.degrees.inputs
@@ -194,11 +194,11 @@ class Structures:
         return replace(candidate, options=replace(candidate.options, inputs=inputs), fit=fit, size=size)
 
     def _start(self, model: AnyModel) -> Begin:
-        """Return the poles of a model, without integrators, and its delays."""
+        """Return the denominator of a model, without integrators, and its delays."""
         return np.atleast_1d(np.poly(self.measured.free_poles(model)).real), tuple(delays_of(model))
 
     def model(self, poles: int, zeros: int) -> AnyModel | None:
-        """Return a model that has been fitted; None where there were too few samples."""
+        """Return a model that was fitted; None if there were too few samples."""
         found = self.found.get((poles, zeros))
         return None if found is None else found.fit.model
 
@@ -211,22 +211,22 @@ class Structures:
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Sums of second-order submodels with integrators in the first of them, in one setting of the records."""
+    """Sums of second-order submodels, the first one with integrators, in one setting of the records."""
 
     records: Sequence[Record]
     hold: Holds
-    #: Of one submodel.
+    #: Options of one submodel.
     options: AdditiveOutputError
 
     @classmethod
     def of(cls, records: Sequence[Record], setting: Setting, integrators: int, delays: tuple[float, float]) -> "Sums":
-        """Lay records out."""
+        """Prepare records."""
         hold, state, before, offset = setting
         options = AdditiveOutputError(_modes(1, integrators), delays, state, offset, input_before=before)
         return cls([with_hold(record, hold) for record in records], hold, options)
 
     def tried(self, order: int, span: Span) -> list[Candidate | None]:
-        """Fit the sum of an order, integrators included; None where there are too few samples."""
+        """Fit the sum of an order, integrators included; None if there are too few samples."""
         assert span.modes is not None
         number, odd = divmod(order - self.options.integrators, 2)
         return [self._fit(number)] if not odd and span.modes[0] <= number <= span.modes[1] else []
@@ -277,7 +277,7 @@ class SmallModels:
                     yield candidate
 
     def _laid_out(self, setting: Setting, integrators: int) -> Structures:
-        """Lay records out; another hold or offset has its minima near those that are known."""
+        """Prepare records; with another hold or offset, searches start at known models."""
         key = setting, integrators
         if key not in self._structures:
             pairs = ((one, number) for one, number in self._structures if one.state == setting.state)
@@ -295,7 +295,7 @@ def grid(
     delays: tuple[float, float],
     several: Several | None = None,
 ) -> Ranking:
-    """Fit structures of ever more poles, until the best lies inside or there are no more."""
+    """Fit structures of increasing order, until the best lies inside the grid or none is left."""
     families = [
         Structures.of(records, setting, integrators, delays, None, several)
         if span.modes is None
@@ -320,7 +320,7 @@ def grid(
 
 
 def still_pays(ranking: Ranking, order: int) -> bool:
-    """Whether structures of about the greatest order are the best of those that leave white noise."""
+    """Return whether a structure of about the greatest order is the best in white noise."""
     best = min((each for each in ranking.candidates if each.is_admissible), key=_criterion_in_white_noise, default=None)
     return best is not None and order - best.options.order < BEYOND
 
@@ -331,6 +331,6 @@ def _criterion_in_white_noise(candidate: Candidate) -> float:
 
 
 def _promising(family: Structures | Sums, ranking: Ranking) -> bool:
-    """Whether structures with a number of integrators may still become the best."""
+    """Return whether structures with a number of integrators may still become the best."""
     own = ranking.of(integrators=family.options.integrators)
     return own is None or own.best.criterion - ranking.best.criterion < BEHIND

@@ -1,4 +1,4 @@
-"""What is chosen of a model and of the treatment of its records where nothing is given, and why."""
+"""Options of a model and of the treatment of its records, given or chosen."""
 
 from dataclasses import dataclass, field
 
@@ -17,14 +17,14 @@ from ctid_cli.text import probability
 
 @dataclass(frozen=True)
 class Given:
-    """What of a model and of the treatment of its records is given; what is None is chosen.
+    """Given options of a model and of the treatment of its records; what is None is chosen.
 
     Parameters
     ----------
     poles, zeros : int or tuple of int, optional
-        Number, or least and greatest number, of poles (integrators not among them) and zeros.
+        Number, or range of the number, of poles (without integrators) and zeros.
     integrators : int, optional
-        Poles at the origin; chosen among 0 and 1, and 0 where a number of poles is given.
+        Poles at the origin; 0 or 1 is chosen, but 0 if the number of poles is given.
     delay_bounds : tuple of float, optional
         Least and greatest delay [s]; two equal numbers are a known delay.
     initial_state : {"rest", "estimate", "periodic"}, optional
@@ -34,21 +34,21 @@ class Given:
     input_before : float or "first", optional
         Input before the first sample of a record that begins at rest [input unit].
     hold : {"auto", "zoh", "foh", "band-limited"} or tuple of these but "auto", default "auto"
-        The input between its samples; a tuple has the hold of each of several inputs.
+        Hold of the input; a tuple has the hold of each of several inputs.
     loss : {"squares", "huber", "tukey"}, optional
-        What output errors count in the fit; chosen are squares, or where there are outliers and it helps, tukey. All
-        else is chosen by squares, in the second case without the outliers.
+        Loss of output errors; squares are chosen, or tukey if there are outliers and it helps. All else is chosen with
+        squares, in the second case without the outliers.
     fixed : tuple of Fixed, optional
         Known parameters of the fit.
     bounds : tuple of Bound, optional
         Bounds of parameters of the fit.
     noise_model : str, default "white"
-        Noise that is estimated with the plant: ``arma:P,Q``, or ``auto``; the choice is made without it.
+        Noise model estimated with the plant: ``arma:P,Q``, or ``auto``; the choice does not use it.
     inputs : tuple of InputModel, optional
-        What is given of each of several inputs by itself.
+        Given options of each of several inputs.
     modes : tuple of int, optional
-        Least and greatest number of second-order submodels, of which the model is then a sum, in place of poles and
-        zeros; integrators, in the first submodel, are none where they are not given.
+        Range of the number of second-order submodels, if the model is their sum, in place of poles and zeros;
+        integrators, in the first submodel, are 0 unless given.
     """
 
     poles: int | tuple[int, int] | None = None
@@ -68,12 +68,12 @@ class Given:
 
     @property
     def typed(self) -> bool:
-        """Whether inputs have degrees of their own, of which nothing is chosen."""
+        """Whether degrees of single inputs are given, so that no structure is chosen."""
         return any((one.poles, one.zeros, one.integrators) != (None,) * 3 for one in self.inputs or ())
 
     @property
     def delays_given(self) -> tuple[float, float] | None:
-        """The range that holds the delays of all inputs; None where that of one is to be chosen."""
+        """Range that contains the delays of all inputs; None if one of them is to be chosen."""
         own = [one.delay_bounds for one in self.inputs or ()]
         given = [self.delay_bounds if bounds is None else bounds for bounds in own] or [self.delay_bounds]
         known = [bounds for bounds in given if bounds is not None]
@@ -83,19 +83,19 @@ class Given:
 
     @property
     def delays_of_inputs(self) -> tuple[InputModel, ...] | None:
-        """The given ranges of single inputs."""
+        """Given delay ranges of single inputs."""
         own = [InputModel(one.name, delay_bounds=one.delay_bounds) for one in self.inputs or ()]
         return tuple(one for one in own if one.delay_bounds is not None) or None
 
     @property
     def span(self) -> Span:
-        """Structures that are admitted; where inputs have degrees of their own, small ones to compare treatments."""
+        """Admitted structures; if degrees of single inputs are given, small ones to compare treatments."""
         if self.modes is not None:
             return Span(integrators=(self.integrators or 0,), modes=self.modes)
         if self.typed:
             own = [one.integrators for one in self.inputs or () if one.integrators is not None]
             treated = None not in (self.initial_state, self.offset, self.delays_given) and self.hold != "auto"
-            # Where nothing of the treatment is open the smallest will do.
+            # The smallest structure suffices if no treatment is to be chosen.
             poles, zeros = ((1, 1), (0, 0)) if treated else ((1, 3), (0, 2))
             return Span(poles, zeros, (max(own, default=self.integrators or 0),))
         poles, zeros = (
@@ -106,7 +106,7 @@ class Given:
         return Span(poles, zeros, free if self.integrators is None else (self.integrators,))
 
     def check(self) -> None:
-        """Refuse what does not go together, with an OptionError."""
+        """Raise an OptionError if given options contradict each other."""
         if self.modes is not None and (self.fixed or self.poles is not None or self.zeros is not None):
             raise OptionError("modes", "modes choose the submodels: give no poles, zeros or known coefficients besides")
         delays = self.delay_bounds or (0.0, 1.0)
@@ -114,7 +114,7 @@ class Given:
         integrators = max(self.span.integrators)
         if isinstance(self.poles, tuple) and fewest_zeros > most + integrators - int(delays[0] < delays[1]):
             raise OptionError("zeros", f"no structure has at least {fewest_zeros} zeros and at most {most} poles")
-        # A single structure is checked as such.
+        # A single structure is checked itself, a range by its fewest poles.
         poles, zeros = (self.poles, fewest_zeros) if isinstance(self.poles, int) else (max(least, 1), 0)
         DelayProfile(
             *(poles, zeros, delays),
@@ -132,20 +132,20 @@ class Given:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """A structure and a treatment, and the candidates that they were chosen from.
+    """A structure and a treatment, with the candidates from which they were chosen.
 
     Parameters
     ----------
     options : DelayProfile or AdditiveOutputError
-        What is to be fitted.
+        Options to fit.
     records : tuple of Record
-        The records with the hold that was chosen.
+        Records with the chosen hold.
     fitted : tuple of Record
-        The same, or parts of long ones, to which the candidates were fitted.
+        These records, or parts of long ones, to which the candidates were fitted.
     ranking : Ranking
         All structures of the grid, the best first.
     answer : ResponseTest
-        Whether a response of the outputs to the inputs is seen at all.
+        Test for a response of the outputs to the inputs.
     sentences : tuple of str
         One for each choice, with its criterion and that of the runner-up.
     """
@@ -159,12 +159,12 @@ class Choice:
 
     @property
     def seen(self) -> bool:
-        """Whether there is a model: a response is seen, and the best candidate describes it."""
+        """Whether there is a model, that is, whether a response is detected."""
         return self.answer.seen
 
     @property
     def why_none(self) -> str:
-        """Why there is none."""
+        """Reason why there is no model."""
         evidence = f" {self.answer.evidence}" if self.answer.explained == self.answer.explained else ""
         return (
             "There is no model here: the output is not seen to answer to the input "
@@ -172,7 +172,7 @@ class Choice:
         )
 
     def words(self) -> list[str]:
-        """Return the choice as the options of ``ctid fit``."""
+        """Return the choice as options of ``ctid fit``."""
         options, inputs = self.options, tuple[InputModel, ...]()
         if isinstance(options, AdditiveOutputError):
             found = ["--model", "additive", "--terms", terms_text(options.terms)]

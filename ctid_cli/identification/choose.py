@@ -1,8 +1,8 @@
-"""The choice of delay range, treatment, hold and structure, in this order, by one criterion.
+"""Choice of delay range, treatment, hold and structure, in this order, by one criterion.
 
-Range, treatment and hold are chosen with a few small structures; then the grid of structures is fitted once. Where an
-estimated state is compared with rest, all candidates are fitted to the samples after the greatest delay, which are all
-that an unknown input before the record leaves to an estimated state.
+Range, treatment and hold are chosen with a few small structures; then the grid of structures is fitted once. To compare
+an estimated state with rest, all candidates are fitted to the samples after the greatest delay: with an unknown input
+before the record, an estimated state describes only these.
 """
 
 from collections.abc import Sequence
@@ -36,28 +36,28 @@ from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record, as_records
 from ctid_cli.signals.treatment import Holds
 
-#: Greatest delay that is tried unless the record shows a later response, as shares of the record.
+#: Greatest delay that is tried, and its limit if the record shows a later response, as shares of the record.
 LATEST, LATER = 0.1, 0.5
 #: The range of the delay ends at this multiple of the delay of a small model, plus this number of sampling intervals:
-#: the delay of a model with too few poles is too long.
+#: with too few poles the delay is overestimated.
 REACH, FURTHER = 1.5, 3
-#: A delay beyond this share of the range is at its end.
+#: A delay beyond this share of the range counts as at its end.
 AT_END = 0.9
-#: A range this much narrower is worth another grid.
+#: The grid is fitted again for a range narrower than this share.
 MUCH_NARROWER = 0.5
-#: Criteria that differ by less are equal but for rounding: of integrators alone a state is an offset.
+#: Smaller differences of criteria are rounding: for integrators alone a state is equivalent to an offset.
 TIE = 1e-3
 
 
 def choose(records: Record | Sequence[Record], given: Given | None = None, time_unit: str = "s") -> Choice:
-    """Choose what is not given of the structure of a model and of the treatment of its records.
+    """Choose those parts of a model's structure and of the treatment of its records that are not given.
 
     Parameters
     ----------
     records : Record or sequence of Record
-        One for each experiment.
+        One record for each experiment.
     given : Given, optional
-        What is given; by default nothing.
+        Given options; by default none.
     time_unit : str, default "s"
         Unit of the records' times, for the sentences.
 
@@ -71,7 +71,7 @@ def choose(records: Record | Sequence[Record], given: Given | None = None, time_
     DataError
         If a record cannot be used.
     OptionError
-        If what is given does not go together.
+        If given options contradict each other.
     """
     several = as_records(records)
     given = given or Given()
@@ -113,13 +113,13 @@ class _Choosing:
         self.said: list[str] = []
 
     def choice(self) -> Choice:
-        """Return what is chosen."""
+        """Return the choice."""
         delays, latest = self._delays()
         setting = self._setting(self.span, delays)
         if self.given.typed:
             return self._typed(setting, delays)
         ranking = self._grid(setting, delays)
-        # Small models may miss so much that a state makes up for it, or that their delay is far too long.
+        # A state, or a far too long delay, may make up for the dynamics that small models miss.
         span, narrower = Span.only(ranking.best.options), self._range_of(ranking, delays)
         narrower = narrower if narrower[1] < MUCH_NARROWER * delays[1] else delays
         confirmed = self._setting(span, narrower, ranking.best.fit.model)
@@ -134,7 +134,7 @@ class _Choosing:
         return self._chosen(ranking.best.options, setting, ranking, said)
 
     def _typed(self, setting: Setting, delays: tuple[float, float]) -> Choice:
-        """Return the choice where the degrees of each input are given."""
+        """Return the choice if degrees of single inputs are given."""
         ranking = self.models.compared([setting])
         delays = self._range_of(ranking, delays)
         given, treated = self.given, ranking.best.options
@@ -145,7 +145,7 @@ class _Choosing:
         return self._chosen(options, setting, ranking, said)
 
     def _chosen(self, options: Searched, setting: Setting, ranking: Ranking, about: Sequence[str]) -> Choice:
-        """Return a choice with what was said of it."""
+        """Return a choice with its sentences."""
         best = ranking.best
         options = replace(options, loss=self.given.loss or "squares", noise_model=self.given.noise_model)
         if isinstance(options, DelayProfile):
@@ -189,7 +189,7 @@ class _Choosing:
         hints = [analyse_response(each).delay for record in self.few for each in record.each_input]
         seen = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
         latest = _rounded(min(max(LATEST * length, seen), LATER * length))
-        # An estimated state does no harm to the delay; rest may.
+        # Assuming rest may bias the delay; an estimated state does not.
         settings = self._settings(latest)[-1:]
         models = self._small(self._common(settings, latest), self.span, (0.0, latest), most=2).compared(settings)
         self._note(models)
@@ -201,7 +201,7 @@ class _Choosing:
             self.several = self.several._replace(first_delays=tuple(delays_of(models.best.fit.model)))
 
     def _range_of(self, ranking: Ranking, delays: tuple[float, float]) -> tuple[float, float]:
-        """Return the range that the delay of the best model asks for, within another; that one where it is given."""
+        """Return the range around the delay of the best model, within another; a given range unchanged."""
         if self.given.delays_given is not None:
             return delays
         interval = max(float(np.median(np.diff(record.t))) for record in self.few)
@@ -211,12 +211,12 @@ class _Choosing:
     # --- state, offset and hold ------------------------------------------------------------------------
 
     def _setting(self, span: Span, delays: tuple[float, float], near: AnyModel | None = None) -> Setting:
-        """Return state, offset and hold, as structures of a span show them; their minima may be near a known model."""
+        """Return the best state, offset and hold with structures of a span; searches may start at a known model."""
         self.said = []
         settings = self._settings(delays[1])
         rests = [each for each in settings if each.initial_state == "rest"]
         if len(rests) > 1:
-            # The level before the record is told by all samples, the first ones above all.
+            # All samples determine the level before the record, mainly the first ones.
             level = self._small(self.few, span, delays, near).compared(rests).best.options.input_before
             settings = [each for each in settings if each.initial_state != "rest" or each.input_before == level]
         models = self._small(self._common(settings, delays[1]), span, delays, near)
@@ -234,7 +234,7 @@ class _Choosing:
         return setting
 
     def _treated(self, models: Ranking, length: float) -> Searched:
-        """Return state and offset: rest, unless the estimated state or the first samples speak against it."""
+        """Return state and offset: rest, unless the criterion or the first samples reject it."""
         rest, estimated = (models.of(initial_state=state) for state in ("rest", "estimate"))
         chosen = models
         if rest is not None and estimated is not None:
@@ -249,10 +249,10 @@ class _Choosing:
             self.said.append(sentences.of_offset(chosen))
         return chosen.best.options
 
-    # --- what there is to compare ----------------------------------------------------------------------
+    # --- settings to compare ---------------------------------------------------------------------------
 
     def _settings(self, latest: float) -> list[Setting]:
-        """Return the states that can be compared, with an offset."""
+        """Return settings with the states that can be compared, with an offset."""
         return [
             Setting(self.first_hold, state, before, self.given.offset or "estimate")
             for state, before in self._states(latest)
@@ -266,7 +266,7 @@ class _Choosing:
         return [state for state in found if state[0] != "estimate" or determined or len(found) == 1]
 
     def _holds(self) -> list[Holds]:
-        """Return the holds to compare: an input that jumps between levels shows that it is held, as in most loops."""
+        """Return the holds to compare; steps, and an input in a loop, count as held."""
         if self.given.hold != "auto" or self._moves != {"continuous"}:
             return [self.first_hold]
         if any(record.feedback for record in self.records):
@@ -278,7 +278,7 @@ class _Choosing:
 
     @property
     def _moves(self) -> set[str]:
-        """How the inputs move."""
+        """Kinds of changes of the inputs."""
         return {input_moves(each).kind for record in self.records for each in record.each_input}
 
     def _common(self, settings: Sequence[Setting], latest: float) -> list[Record]:
@@ -293,5 +293,5 @@ def _at_end(ranking: Ranking, delays: tuple[float, float]) -> bool:
 
 
 def _rounded(delay: float) -> float:
-    """Return a delay with three digits, so that it is the same when it is typed."""
+    """Return a delay rounded to the three digits of the printed options."""
     return float(f"{delay:.3g}")

@@ -1,12 +1,13 @@
-r"""The criterion that models of the same samples are chosen by.
+r"""Criterion by which models of the same samples are compared.
 
 Coloured noise makes the usual criteria favour too many parameters. One autoregressive model of the residuals of the
-closest fit, of the order of least BIC, whitens the residuals of all candidates; with V the squared innovations of a
-candidate after one step of generalised least squares, N their number and p that of its parameters,
+closest fit, with the order of least BIC, whitens the residuals of all candidates; with V the sum of squared innovations
+of a candidate after one step of generalised least squares, N their number and p its number of parameters, it is
 
 .. math:: N \ln (V / N) + 1.5\,p \ln N .
 
-A noise model for each candidate would not do: what too small a model misses is coloured, and would pass as noise.
+A noise model for each candidate would favour small models: the dynamics they miss are coloured, and would pass as
+noise.
 """
 
 from collections.abc import Sequence
@@ -28,14 +29,14 @@ from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
 from ctid_cli.models.additive import terms_text
 from ctid_cli.signals.treatment import Holds
 
-#: Output errors of records, and their derivatives by what least squares may still change.
+#: Output errors of records, and their derivatives with respect to the parameters of a least-squares step.
 Errors = tuple[Sequence[Array], Sequence[Array]]
-#: Options of the models that are compared: one fraction, or a sum of submodels.
+#: Options of the compared models: one transfer function, or a sum of submodels.
 Searched = DelayProfile | AdditiveOutputError
-#: What a parameter counts over its share in BIC. Of 134 simulated records of known structure, models so chosen had at
-#: most 1.25 times the error of the true structure in 87 %, with BIC itself in 84 %.
+#: Penalty of a parameter over that in BIC. For 134 simulated records of known structure, models so chosen had at most
+#: 1.25 times the error of the true structure in 87 %, with BIC itself in 84 %.
 PENALTY = 1.5
-#: Names of the bounds at which a pair follows an oscillation of this record's noise.
+#: Names of the bounds at which a pole pair follows an oscillation of this record's noise.
 UNDAMPED = frozenset({"least_damping", "imaginary"})
 
 
@@ -48,20 +49,19 @@ class Candidate:
     options : DelayProfile or AdditiveOutputError
         Structure, range of the delay, and treatment of state and offset.
     hold : {"zoh", "foh", "band-limited"}
-        The input between its samples.
+        Hold of the input.
     fit : MeasuredFit
-        The least squared output error found, without standard errors.
+        Fit with the least squared output error found, without standard errors.
     size : int
-        Number of parameters, those of each record included.
+        Number of parameters, including those of each record.
     criterion : float
-        The criterion; only differences between candidates mean anything.
+        Value of the criterion; only differences between candidates are meaningful.
     criteria : InformationCriteria
         AICc, BIC and FPE of the innovations.
     unseen : float
-        Mean squared error of blocks of the records that fits of the rest did not see, over that of the fit; NaN where
-        it was not looked at.
+        Mean squared error of held-back blocks of the records, over that of the fit; NaN if it was not computed.
     stands : bool
-        Whether that is like in smaller structures.
+        Whether ``unseen`` is similar to that of smaller structures.
     """
 
     options: Searched
@@ -75,14 +75,14 @@ class Candidate:
 
     @property
     def is_admissible(self) -> bool:
-        """Whether the data determine it, less damping than is admitted would not improve it, and it stands."""
+        """Whether the data determine it, no pole pair is at a bound of ``UNDAMPED``, and it stands."""
         box, held = self.fit.box, self.fit.held_poles
         undamped = box is not None and any(UNDAMPED.intersection(box.met_by(pole)) for pole in held)
         return self.stands and self.fit.condition_number <= LARGEST_CONDITION and not undamped
 
     @property
     def name(self) -> str:
-        """Poles, zeros and integrators: ``2/1``, ``1/0 + 1`` or, of several inputs, ``3/1,2``; of a sum its terms."""
+        """Poles, zeros and integrators: ``2/1``, ``1/0 + 1`` or, for several inputs, ``3/1,2``; for a sum its terms."""
         options = self.options
         if isinstance(options, AdditiveOutputError):
             return terms_text(options.terms)
@@ -94,18 +94,18 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """Candidates, the least criterion first and those that are not admissible last; their noise."""
+    """Candidates by increasing criterion, inadmissible ones last, and their noise model."""
 
     candidates: tuple[Candidate, ...]
     noise: NoiseModel
 
     @property
     def best(self) -> Candidate:
-        """The first candidate."""
+        """First candidate."""
         return self.candidates[0]
 
     def of(self, **options: object) -> "Ranking | None":
-        """Return the candidates with these options; None where there are none."""
+        """Return the candidates with these options; None if there are none."""
         found = [
             each
             for each in self.candidates
@@ -114,7 +114,7 @@ class Ranking:
         return Ranking(tuple(found), self.noise) if found else None
 
     def runner_up(self, *names: str) -> Candidate | None:
-        """Return the first candidate that the best is better than and that differs in its hold or options, or None."""
+        """Return the first candidate that is not better than the best and differs in a named option, or None."""
 
         def key(each: Candidate) -> tuple[object, ...]:
             return tuple(each.hold if name == "hold" else getattr(each.options, name) for name in names)
@@ -124,19 +124,19 @@ class Ranking:
 
 
 def ranked(candidates: Sequence[Candidate]) -> Ranking:
-    """Return candidates by their criterion; all must have been fitted to the same samples."""
+    """Rank candidates by their criterion; all must have been fitted to the same samples."""
     closest = min(candidates, key=lambda each: (not each.is_admissible, each.fit.cost))
     noise = noise_of(closest.fit.residuals)
     return Ranking(in_order([_judged(each, noise) for each in candidates]), noise)
 
 
 def in_order(judged: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """Return candidates by their criterion, those that are not admissible last."""
+    """Return candidates by increasing criterion, inadmissible ones last."""
     return tuple(sorted(judged, key=lambda each: (not each.is_admissible, each.criterion)))
 
 
 def criteria_of(models: Sequence[Errors], parameters: Sequence[int]) -> list[float]:
-    """Return the criterion of models of the same samples under the noise of the one that is closest."""
+    """Return the criterion of models of the same samples, with the noise model of the closest one."""
     closest, _ = min(models, key=lambda model: sum(float(e @ e) for e in model[0]))
     noise = noise_of(closest)
     return [
@@ -146,7 +146,7 @@ def criteria_of(models: Sequence[Errors], parameters: Sequence[int]) -> list[flo
 
 
 def noise_of(residuals: Sequence[Array]) -> NoiseModel:
-    """Return the autoregressive model of residuals that has the least BIC."""
+    """Return the autoregressive model of residuals with the least BIC."""
     return fit_noise_model(residuals, penalty=float(np.log(sum(block.size for block in residuals))))
 
 

@@ -1,4 +1,4 @@
-"""What to know before a fit is used: at most five sentences, ordered by what they cost."""
+"""Warnings of a fit: at most five sentences, the most important first."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -18,26 +18,26 @@ from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.signals.record import Record
 from ctid_cli.text import count, listed, probability
 
-#: Why residuals may depend on inputs that are still to come.
+#: Why residuals may depend on later inputs.
 AHEAD = "the delay is too long, the output was recorded ahead of the input, or a loop acts"
-#: Sentences that are printed.
+#: Most sentences that are printed.
 MOST = 5
-#: Below this fit something may be missing [%].
+#: A fit below this is reported [%].
 LOW_FIT = 80.0
-#: Residuals depend on the input where chance gives as much less often than this; of feedback, which is looked for among
-#: many inputs, and explains this share of the residuals' variance.
+#: Significance levels at which residuals depend on the input, and the input on residuals (stricter, because many inputs
+#: are tested), and least share of the residuals' variance that such feedback explains.
 DEPENDENT, FED_BACK, FEEDBACK_SHARE = 0.01, 1e-4, 0.01
-#: Endings of a search at which nothing else of a fit means anything.
+#: Endings of a search after which no other result of a fit is meaningful.
 UNFINISHED = (Status.MAX_ITERATIONS, Status.DIVERGED, Status.REFLECTED)
-#: A real pole is slow where its time constant exceeds this fraction of the record.
+#: A real pole is slow if its time constant exceeds this fraction of the record.
 SLOW = 0.6
-#: Instants of outliers that are listed.
+#: Most instants of outliers that are listed.
 LISTED = 3
 
 
 @dataclass(frozen=True)
 class FitWarning:
-    """What was observed of a fit, and a remedy that was tried and helped, if there is one."""
+    """An observation about a fit, with the remedy if one was tried and helped."""
 
     observed: str
     remedy: Remedy | None = None
@@ -47,12 +47,12 @@ class FitWarning:
 
 
 def with_warnings(found: Identification, time_unit: str = "s") -> Identification:
-    """Return a fit with its warnings, after changes of it have been tried on its records."""
+    """Try changes of a fit on its records, and return it with its warnings."""
     return replace(found, warnings=tuple(map(str, fit_warnings(found, time_unit))))
 
 
 def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning]:
-    """Try changes of a fit, and return its warnings, the costliest first."""
+    """Try changes of a fit, and return its warnings, the most important first."""
     fit, records = found.fit, found.records
     growing = [
         growth_time(record.t[use], record.y[use], signal.at(record.t[use]))
@@ -74,7 +74,7 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
         or len(found.tests) < len(records) * len(delays_of(fit.model))
     )
     suspicious |= not all(test.white and test.uncorrelated for test in found.tests)
-    # Changes are compared as output-error fits are.
+    # Remedies compare output-error fits only.
     tried = Trials([], [])
     if fit.noise is None and not isinstance(fit, MultiInputFit):
         tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=seen)
@@ -85,7 +85,7 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
         return [FitWarning(f"{no_model}. {found.answer.evidence[:-1]}"), *named]
     others = [*of_lost_poles(fit), *_of_residuals(found, mended, time_unit)]
     if not named:
-        # Of an estimate that will change, neither its search nor its errors need to be known.
+        # The search and the errors of an estimate that will change are not reported.
         others += [
             *_of_noise(fit),
             *_of_fit(fit, tried),
@@ -100,11 +100,11 @@ def _used(found: Identification) -> Iterator[tuple[Record, BoolArray]]:
     return zip(found.records, found.fit.linear.used, strict=True)
 
 
-# --- what a remedy is for ----------------------------------------------------------------------------
+# --- observations with a remedy ----------------------------------------------------------------------
 
 
 def _observed(remedy: Remedy, found: Identification, time_unit: str) -> str:
-    """Return what a kind of remedy mends, as it was seen."""
+    """Return the observation that a kind of remedy addresses."""
     fit, options = found.fit, found.options
     if remedy.kind == "loss":
         return _outliers(found, time_unit)
@@ -123,7 +123,7 @@ def _observed(remedy: Remedy, found: Identification, time_unit: str) -> str:
 
 
 def _dependence(found: Identification, least: float = 0.05) -> str:
-    """Return which residuals depend on the input most, if chance would give as much less often than a level."""
+    """Return which residuals depend most on the input, if they do at a significance level."""
     tests = [(test.cross_p_value, k, test) for k, test in enumerate(found.tests, start=1)]
     p, k, test = min(tests, default=(1.0, 0, None), key=lambda each: np.nan_to_num(each[0], nan=1.0))
     if test is None or not p < least:
@@ -141,7 +141,7 @@ def _dependence(found: Identification, least: float = 0.05) -> str:
 
 
 def _outliers(found: Identification, time_unit: str) -> str:
-    """Return which samples are far from their neighbours; nothing where none is."""
+    """Return the samples that are far from their neighbours; empty if there are none."""
     listed_times, largest, total = [], 0.0, 0
     for k, ((record, use), e) in enumerate(zip(_used(found), found.fit.linear.residuals, strict=True), start=1):
         places, off = residual_outliers(e)
@@ -159,7 +159,7 @@ def _outliers(found: Identification, time_unit: str) -> str:
 
 
 def _slow_pole(found: Identification, time_unit: str) -> str:
-    """Return that a real pole is slow for the record; nothing where none is."""
+    """Return that a real pole is slow for the record; empty if none is."""
     poles = found.fit.model.poles
     sizes = np.abs(poles[(poles.imag == 0.0) & (poles.real != 0.0)])
     longest = max(record.duration for record in found.records)
@@ -169,7 +169,7 @@ def _slow_pole(found: Identification, time_unit: str) -> str:
     return f"{what}: over a record of {longest:.4g} {time_unit} it is nearly indistinguishable from an integrator"
 
 
-# --- what has no remedy ------------------------------------------------------------------------------
+# --- observations without a remedy -------------------------------------------------------------------
 
 
 def _of_validation(found: Identification) -> Iterator[FitWarning]:
@@ -185,7 +185,7 @@ def _of_validation(found: Identification) -> Iterator[FitWarning]:
 
 
 def _of_residuals(found: Identification, mended: set[Kind], time_unit: str) -> Iterator[str]:
-    """What residuals and record show beside the model."""
+    """Yield warnings about residuals and outputs."""
     if not mended & {"structure", "delay", "hold"} and (what := _dependence(found, DEPENDENT)):
         yield f"{what}: {AHEAD if 'later values' in what else 'the model misses a part of the response'}"
     outliers = _outliers(found, time_unit)
@@ -196,7 +196,7 @@ def _of_residuals(found: Identification, mended: set[Kind], time_unit: str) -> I
         where = f"{100 * share:.2g} % of the output samples lie exactly at the least or greatest value"
         yield f"{where}: if a limit of the sensor or the actuator cut them off, parameters and intervals are biased"
     fit, noisy = found.fit.linear, found.fit.noise is not None
-    # Of residuals with outliers nothing else is told.
+    # With outliers the residuals are not tested further.
     for k, (record, use) in enumerate(_used(found) if not outliers else ()):
         if record.feedback:  # which is known
             continue
@@ -210,7 +210,7 @@ def _of_residuals(found: Identification, mended: set[Kind], time_unit: str) -> I
         seen = min(filter(None, dependences), key=lambda each: each.feedback_p_value, default=None)
         if seen is None or seen.feedback_share < FEEDBACK_SHARE:
             continue
-        # Dynamics that are missed may leave something for later inputs to tell.
+        # Missed dynamics may correlate residuals with later inputs too.
         if seen.feedback_p_value < min(FED_BACK, seen.pole_p_value):
             what = "The input follows earlier residuals" if acting is record else "The reference follows the output"
             where = f"{what} ({probability(seen.feedback_p_value)})"
@@ -218,7 +218,7 @@ def _of_residuals(found: Identification, mended: set[Kind], time_unit: str) -> I
 
 
 def _of_fit(fit: MeasuredFit, tried: Trials) -> Iterator[str]:
-    """That a fit is low, and what did not raise it; with outliers it always is."""
+    """Yield that a fit is low, as it always is with outliers, and which changes did not raise it."""
     if fit.fit_percent < LOW_FIT and fit.weighting is None and fit.noise is None:
         what = f"The fit is {fit.fit_percent:.1f} %: {100 * (1 - fit.r2):.2g} % of the output's variance is left"
         words = (word for option in tried.without_gain for word in option.split())
@@ -227,7 +227,7 @@ def _of_fit(fit: MeasuredFit, tried: Trials) -> Iterator[str]:
 
 
 def _of_noise(fit: MeasuredFit) -> Iterator[str]:
-    """That the estimate depends on how the noise is modelled."""
+    """Yield that the estimate depends on the noise model."""
     if fit.noise is not None and fit.noise.differs:
         what = "The output-error fit and the fit with the noise model differ by more than chance gives"
         found = f"(Hausman's test, {probability(fit.noise.test.p_value)})"
@@ -235,7 +235,7 @@ def _of_noise(fit: MeasuredFit) -> Iterator[str]:
 
 
 def of_search(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
-    """How the search ended, where it did not end well."""
+    """Yield how the search ended, unless it converged."""
     if fit.status not in (Status.CONVERGED, Status.DELAY_AT_BOUND) and not (fit.held_poles or fit.bounds_met):
         yield fit.status.value.removesuffix(".")
     if fit.bounds_met:
@@ -256,14 +256,14 @@ def of_search(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
 
 
 def of_lost_poles(fit: MeasuredFit) -> Iterator[str]:
-    """That the model has fewer poles than were asked for."""
+    """Yield that the model has fewer poles than specified."""
     if lost := fit.poles_at_infinity:
         gone = f"{'it has' if lost == 1 else 'they have'} run to infinity, where the cost is least"
         yield f"The model has {count(lost, 'pole')} fewer than asked for: {gone}"
 
 
 def of_conditioning(fit: MeasuredFit, known: Uncertainty) -> Iterator[str]:
-    """What the data do not determine."""
+    """Yield what the data do not determine."""
     _, hessian = free_directions(fit.linear)
     names: list[str] = []
     values: list[float] = []
@@ -278,7 +278,7 @@ def of_conditioning(fit: MeasuredFit, known: Uncertainty) -> Iterator[str]:
 
 
 def _of_uncertainty(found: Identification, time_unit: str) -> Iterator[str]:
-    """What the record does not determine, and intervals that cannot be trusted."""
+    """Yield what the record does not determine, and which intervals are unreliable."""
     if slow := _slow_pole(found, time_unit):
         yield slow
     fit, uncertainty = found.fit, found.uncertainty
@@ -292,7 +292,7 @@ def _of_uncertainty(found: Identification, time_unit: str) -> Iterator[str]:
         yield f"{what} unsafe: so far from the estimate the output is not linear in the parameters"
     low, high = found.options.delay_bounds
     interval = None if isinstance(fit, MultiInputFit) else found.delay_interval
-    # Below zero there is nothing left to search.
+    # A delay cannot be below zero, so that end is not reported.
     ends = (
         [] if interval is None else [f"{low:g}"] * (interval.open_low and low > 0) + [f"{high:g}"] * interval.open_high
     )

@@ -1,4 +1,4 @@
-"""Output errors of blocks of the records that a fit does not see, to compare two fits of the same records."""
+"""Output errors of held-back blocks of the records, to compare two fits of the same records."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,46 +14,46 @@ from ctid_cli.inference.criteria import percent_from_r_squared
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record
 
-#: Where a fit begins: a denominator without integrators, and a delay [s].
+#: Start of a fit: a denominator without integrators, and a delay [s].
 Near = tuple[Array, float]
-#: Blocks of all records that are held back, each once, and groups in which they are: the last group is what comes at
-#: the end. The standard error of ten differences has a relative error of 24 %.
+#: Blocks of all records, each held back once, and groups of blocks that are held back together: the last group has the
+#: ends of the records. The standard error of ten differences has a relative error of 24 %.
 BLOCKS, FOLDS = 10, 5
-#: A record has at least this many blocks.
+#: Fewest blocks of a record.
 FEWEST_BLOCKS = 2
-#: Blocks of fewer samples, or of which fewer than this fraction see the input move, are too short to compare fits.
+#: Fits are not compared if a block has fewer samples, or the input moves in a smaller fraction of the blocks.
 SHORTEST, MOVING = 20, 0.8
-#: A smaller difference of two fits is not worth a word [%].
+#: Smaller differences of two fits are ignored [%].
 WORTHWHILE = 0.3
-#: A structure has at least three samples for each parameter. If it describes the record, its mean squared error of what
-#: it did not see is then at most (1 + 1/3) / (1 - 1/3) of that of its fit.
+#: A structure has at least three samples for each parameter. If it describes the record, its mean squared error of
+#: held-back blocks is then at most (1 + 1/3) / (1 - 1/3) of that of its fit.
 OPTIMISTIC = 2.0
 
 
 @dataclass(frozen=True)
 class Gain:
-    """How much better one fit is than another."""
+    """Improvement of one fit over another."""
 
     #: Fit of both [%], and standard error of their difference [%].
     before: float
     after: float
     standard_error: float
-    #: Mean of the blocks in its standard errors [-], the greater one of two: of the falls of their squared errors, and
-    #: of the logarithms of the ratios, which blocks of different size give alike.
+    #: Mean over the blocks in its standard errors [-], the greater of two: that of the decreases of their squared
+    #: errors, and that of the logarithms of the ratios, in which blocks of different size count equally.
     score: float
     #: Ratio of the squared errors at the end of the records, where a fit extrapolates [-].
     end: float
 
     @property
     def helps(self) -> bool:
-        """Whether the difference is worth it, and more than two standard errors."""
+        """Whether the difference is not negligible, and more than two standard errors."""
         return self.after - self.before > WORTHWHILE and self.score > 2.0
 
 
 def block_numbers(records: Sequence[Record]) -> list[IntArray]:
-    """Return the number of each sample's block, -1 for the beginning of a record, which is never held back.
+    """Return the number of each sample's block, -1 at the beginning of a record, which is never held back.
 
-    Without it the initial state could not be estimated.
+    The initial state is estimated from it.
     """
     each = _blocks_each(records)
     return [np.arange(record.n_samples) * (each + 1) // record.n_samples - 1 for record in records]
@@ -64,7 +64,7 @@ def _blocks_each(records: Sequence[Record]) -> int:
 
 
 def _folds(records: Sequence[Record]) -> list[IntArray]:
-    """Return the group in which each sample is held back, -1 for none: the last one has the end of all records."""
+    """Return the group in which each sample is held back, -1 for none; the last one has the ends of all records."""
     each = _blocks_each(records)
     last = each - -(-each // FOLDS)
     found = []
@@ -75,7 +75,7 @@ def _folds(records: Sequence[Record]) -> list[IntArray]:
 
 
 def long_enough(records: Sequence[Record]) -> bool:
-    """Whether blocks have enough samples, and the input moves in most of them."""
+    """Return whether blocks have enough samples, and the input moves in most of them."""
     moving = []
     for record, numbers in zip(records, block_numbers(records), strict=True):
         u = record.input.at(record.t)
@@ -88,15 +88,15 @@ def long_enough(records: Sequence[Record]) -> bool:
 
 
 def near_model(model: TransferFunction, integrators: int) -> Near:
-    """Return where a fit begins that starts from a model."""
+    """Return the start of a fit at a model."""
     return model.denominator[: model.denominator.size - integrators], model.delay
 
 
 def held_back_errors(options: DelayProfile, records: Sequence[Record], near: Near) -> list[Array]:
     """Return the output errors of all blocks, each from a fit without its outputs; NaN elsewhere, each of shape (N,).
 
-    The input and the state are carried through a block that is held back. Fits begin at the denominator and delay of
-    that of the whole records.
+    Input and state are simulated through a held-back block. Fits start at the denominator and delay of the fit to the
+    whole records.
     """
     whole, folds = options.prepare(records).laid_out, _folds(records)
     errors = [np.full(record.n_samples, np.nan) for record in records]
@@ -113,11 +113,11 @@ def held_back_errors(options: DelayProfile, records: Sequence[Record], near: Nea
 
 
 def standing(ranking: Ranking, records: Sequence[Record]) -> Ranking:
-    """Return structures in order, those last that are too large to predict what they did not see.
+    """Return structures in order, those last that are too large to predict held-back blocks.
 
-    The best of each number of poles is looked at: where its squared error of blocks that were held back is more times
-    that of its fit than in a smaller structure, by a factor that no number of parameters explains, it describes these
-    samples, and not the system. Sums of submodels, and models of several inputs, are not looked at.
+    The best structure of each number of poles is checked: it is overfitted if its ratio of the squared error of
+    held-back blocks to that of its fit exceeds the ratio of a smaller structure by a factor that no number of
+    parameters explains. Sums of submodels, and models of several inputs, are not checked.
     """
     if any(isinstance(each.options, AdditiveOutputError) for each in ranking.candidates) or records[0].several:
         return ranking
@@ -139,7 +139,7 @@ def standing(ranking: Ranking, records: Sequence[Record]) -> Ranking:
 
 
 def _unseen(candidate: Candidate, records: Sequence[Record]) -> float:
-    """Return the mean squared error of blocks that are held back, over that of the fit; infinity where it fails."""
+    """Return the mean squared error of held-back blocks over that of the fit; infinity if a fit fails."""
     options, fit = candidate.options, candidate.fit
     assert isinstance(options, DelayProfile)
     try:
@@ -150,10 +150,10 @@ def _unseen(candidate: Candidate, records: Sequence[Record]) -> float:
 
 
 def compared(before: Sequence[Array], after: Sequence[Array], records: Sequence[Record]) -> Gain:
-    """Compare two fits by their errors at the same samples; the others are NaN.
+    """Compare two fits by their errors at the same samples, NaN at all others.
 
-    The standard error of a difference of fits is, to first order, that of the mean fall of a block's squared error, or
-    of the mean logarithm of the ratio of both, whichever tells more.
+    The standard error of a difference of fits is, to first order, that of the mean decrease of a block's squared error,
+    or of the mean logarithm of the ratio of both, whichever is more significant.
     """
     sums: list[Array] = []
     total, end = 0.0, np.zeros(2)
@@ -173,6 +173,6 @@ def compared(before: Sequence[Array], after: Sequence[Array], records: Sequence[
 
 
 def _score(values: Array) -> float:
-    """Return the mean of values in its standard errors."""
+    """Return the mean of values over its standard error."""
     error = float(np.std(values, ddof=1) / np.sqrt(values.size)) if values.size > 1 else 0.0
     return float(values.mean()) / error if error > 0.0 else 0.0

@@ -1,4 +1,4 @@
-"""From records to a fitted model, with what is not given chosen."""
+"""Fit of a model to records; what is not given is chosen."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,46 +26,46 @@ def identify(
     progress: Progress | None = None,
     time_unit: str = "s",
 ) -> Identification:
-    """Fit a model to records and judge it; what is not given of its structure and treatment is chosen.
+    """Fit a model to records and assess it; structure and treatment are chosen unless given.
 
     Parameters
     ----------
     records : Record or sequence of Record
-        One for each experiment.
+        One record for each experiment.
     options : DelayProfile, AdditiveOutputError, MeasuredSubmodels or Given, optional
-        An estimator, of which nothing is chosen, or what is given; by default everything is chosen, the hold of the
-        input too where it is known at the samples of the output.
+        An estimator, with which nothing is chosen, or given options; by default everything is chosen, including the
+        hold of the input if it is known at the samples of the output.
     validation : Record, optional
-        Another record of the same system, which never enters the choice. Its state and offset are chosen on it, with
-        the model fixed, unless they are given.
+        Another record of the same system, which the choice never uses. Its state and offset are chosen on it, with the
+        model fixed, unless they are given.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
-        What the noise is taken for: white unless the residuals are not, white, or coloured with standard errors and
-        Student's t, or coloured with the intervals of a bootstrap-t.
+        Assumed noise: white unless the residuals are not, white, or coloured with standard errors and Student's t, or
+        coloured with the intervals of a bootstrap-t.
     bootstrap_draws : int, default 500
-        Simulated noise sequences of a bootstrap [-].
+        Number of simulated noise sequences of a bootstrap [-].
     progress : callable, optional
-        Told after each of them how many of how many are done.
+        Called after each of them with the number done and the total.
     time_unit : str, default "s"
         Unit of the records' times, for the sentences.
 
     Returns
     -------
     Identification
-        The model, and everything that tells whether to believe it; ``choices`` has a sentence for each choice.
+        The model with its diagnostics; ``choices`` has a sentence for each choice.
 
     Raises
     ------
     DataError
-        If a record cannot be used, or no response to its input is seen and no number of poles is given.
+        If a record cannot be used, or no response to its input is detected and no number of poles is given.
     OptionError
-        If what is given does not go together.
+        If given options contradict each other.
     TypeError
-        If the options are those of another estimator, which only fits by itself.
+        If the options are those of another estimator, which has only its own ``fit``.
 
     Notes
     -----
-    All is chosen by one criterion, BIC of the innovations with a noise model that all candidates share and each
-    parameter counted 1.5 times; see :func:`~ctid_cli.identification.choose.choose`.
+    All choices use one criterion, BIC of the innovations with a noise model common to all candidates and 1.5 times the
+    usual penalty; see :func:`~ctid_cli.identification.choose.choose`.
 
     Examples
     --------
@@ -92,7 +92,7 @@ def identify(
         raise DataError(f"{choice.why_none} Give the {what} to fit a model all the same.")
     other = None if validation is None else with_hold(validation, choice.records[0].hold)
     if other is not None:
-        # Refused before the fit takes its time.
+        # Checked before the fit, which takes longer.
         laid_out_for(other, choice.options, given)
     found = identification.identify(choice.options, choice.records, None, *noise)
     found = replace(found, choices=choice.sentences)

@@ -1,4 +1,4 @@
-"""From a measured frequency response to a model with everything that tells whether to believe it."""
+"""Fit of a model to a measured frequency response, with diagnostics."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,7 +17,7 @@ from ctid_cli.text import count, probability
 
 
 def identify_frequency_response(data: FrequencyData, options: FrequencyDomain) -> Identification:
-    """Fit a model to a frequency response and judge it.
+    """Fit a model to a frequency response and assess it.
 
     Parameters
     ----------
@@ -29,8 +29,7 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain) -
     Returns
     -------
     Identification
-        The model, and everything that tells whether to believe it; it has no records and no tests of residuals over
-        time.
+        The model with its diagnostics; it has no records and no tests of residuals over time.
 
     Raises
     ------
@@ -68,7 +67,7 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain) -
 
 
 def _answer(fit: FrequencyDomainFit) -> ResponseTest:
-    """Test the model against no response by the F-distribution, each line being a place where noise may have a peak."""
+    """Test the model against no response by the F-distribution, allowing for a peak of the noise at any line."""
     from scipy.stats import f as f_distribution
 
     size, spare = fit.tangent.shape[1], fit.count - fit.tangent.shape[1]
@@ -80,12 +79,12 @@ def _answer(fit: FrequencyDomainFit) -> ResponseTest:
 
 
 def _of_delay(fit: FrequencyDomainFit, options: FrequencyDomain) -> Iterator[str]:
-    """Yield that a delay is missing, if lines that the model misses are met with one."""
+    """Yield that a delay is missing, if the model misses lines that a delay fits."""
     known, most = options.delay_bounds
     missed = fit.misfit_p_value < MISFIT or not fit.white or fit.fit_percent < LOW_FIT
     if not missed or known < most or options.zeros >= options.poles + options.integrators:
         return
-    # A longer delay turns the phase of all lines by more than a quarter.
+    # A longer delay would turn the phase of all lines by more than a quarter turn.
     reach = float(f"{known + 0.5 * np.pi / fit.data.frequencies[fit.data.frequencies > 0.0].min():.2g}")
     searched = replace(options, delay_bounds=(0.0, reach)).prepare(fit.data).fit()
     sizes = fit.count * np.log(fit.cost), searched.count * np.log(searched.cost) + np.log(searched.count)
@@ -95,7 +94,7 @@ def _of_delay(fit: FrequencyDomainFit, options: FrequencyDomain) -> Iterator[str
 
 
 def _warnings(fit: FrequencyDomainFit, answer: ResponseTest) -> Iterator[str]:
-    """Yield what to know before the model is used, the costliest first."""
+    """Yield warnings, the most important first."""
     if not answer.seen:
         yield f"No model: the values are not seen to be anything but noise ({probability(answer.p_value)})"
         return

@@ -1,4 +1,4 @@
-"""What is assumed of the state and the offset of records, and which samples that leaves to compare."""
+"""Assumed state and offset of records, and the samples at which they can be compared."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,23 +14,23 @@ from ctid_cli.inference.signal_features import FEW_CHANGES
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import InitialState, InputBefore
 
-#: Share of the range of the input that it must still cross after the greatest delay, for an estimated state to leave
-#: the gain determined.
+#: Share of its range that the input must cross after the greatest delay, so that an estimated state leaves the gain
+#: determined.
 EXCITED = 0.5
-#: A state is estimated beside an input that changes only a few times if its first change comes after at least this
-#: number of samples, and not before the greatest delay has passed. With a lead of 10 samples an estimated state had 30
-#: times the error of rest, with a lead of 1 a hundred thousand times.
+#: With an input that changes only a few times, a state is estimated if the first change comes after at least this
+#: number of samples and after the greatest delay. With a lead of 10 samples an estimated state had 30 times the error
+#: of rest, with a lead of 1 a hundred thousand times.
 LEAD = 10
-#: Rest is refused where the first samples are, with it, this unlikely: to estimate a state in vain costs little.
+#: Rest is rejected if its first samples are less likely than this: an unneeded estimated state costs little.
 UNLIKELY = 1e-2
 
 
-#: A state before the records, and the input that goes with it.
+#: State before the records, and the input before them.
 State = tuple[InitialState, InputBefore]
 
 
 def states_of(records: Sequence[Record], given: Given) -> list[State]:
-    """Return the states before the records that are to be compared.
+    """Return the states before the records to compare.
 
     Rest is equilibrium with a constant input: the first value, or zero.
     """
@@ -51,9 +51,9 @@ def states_of(records: Sequence[Record], given: Given) -> list[State]:
 
 
 def excited_after(records: Sequence[Record], delay: float) -> bool:
-    """Whether inputs change enough after a delay [s] from the first samples to tell the gain from an estimated state.
+    """Return whether inputs change enough after a delay [s] to separate the gain from an estimated state.
 
-    A state explains most of the response to a single step that comes soon after.
+    A state explains most of the response to a single step soon after the first sample.
     """
     for record in (each for whole in records for each in whole.each_input):
         later = record.t >= record.t[0] + delay
@@ -67,7 +67,7 @@ def excited_after(records: Sequence[Record], delay: float) -> bool:
 
 
 def changes_at_the_beginning_only(records: Sequence[Record]) -> bool:
-    """Whether all inputs are constant but for the first samples: an integrator then answers as a drift does."""
+    """Return whether all inputs are constant after the first samples: an integrator then responds like a drift."""
     long = [record for record in records if record.t.size > LEAD]
     return all(np.ptp(signal.at(record.t[LEAD:])) == 0.0 for record in long for signal in record.held.values())
 
@@ -81,7 +81,7 @@ def without_beginning(records: Sequence[Record], length: float) -> list[Record]:
 
 
 def beginning_is_likely(best: Candidate, noise: NoiseModel, records: Sequence[Record], length: float) -> bool:
-    """Whether a model from rest, fitted to what comes later, explains the first samples of the records too.
+    """Return whether a model from rest, fitted to later samples, also explains the first samples of the records.
 
     Their squared innovations over the variance, and the first error over that of the noise, are chi-square.
     """

@@ -1,4 +1,4 @@
-"""What is reported of each candidate besides its criterion."""
+"""Diagnostics of each candidate besides its criterion."""
 
 from dataclasses import dataclass
 
@@ -16,12 +16,12 @@ from ctid_cli.signals.record import Record
 
 @dataclass(frozen=True, eq=False)
 class JudgedCandidate:
-    """A candidate with what else tells how good it is."""
+    """A candidate with its diagnostics."""
 
     candidate: Candidate
     #: Young's criterion [-].
     yic: float
-    #: Fit of each tenth of each record with the parameters of all the rest, linearised [%].
+    #: Fit of each tenth of each record with the parameters of the rest, linearised [%].
     cross_validated_percent: float
     tests: tuple[ResidualTests, ...]
     #: Fit on the validation record [%].
@@ -29,7 +29,7 @@ class JudgedCandidate:
 
 
 def judged_candidates(choice: Choice, given: Given, validation: Record | None) -> list[JudgedCandidate]:
-    """Judge all candidates of a choice, the best first."""
+    """Compute the diagnostics of all candidates of a choice, the best first."""
     other = None if validation is None else with_hold(validation, choice.ranking.best.hold)
     return [_judged(each, choice, given, other) for each in choice.ranking.candidates]
 

@@ -1,4 +1,4 @@
-"""Parts of long records that choices are made on."""
+"""Parts of long records that are used to choose settings."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,10 +10,10 @@ from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, beginning
 
-#: Samples of all records that settings are compared on, and that the grid of structures is fitted to: what ten seconds
-#: are enough for.
+#: Samples of all records with which settings are compared, and to which the grid of structures is fitted: what can be
+#: computed in ten seconds.
 FEW, MANY = 2000, 2500
-#: The beginning of a record stands for the whole if input and output move so much there, as a share of all.
+#: The beginning of a record is used for the whole if input and output vary there by at least this share of all.
 LIVELY = 0.5
 
 
@@ -21,12 +21,12 @@ class Parts(NamedTuple):
     """Parts of records."""
 
     records: list[Record]
-    #: Whether they begin with the records.
+    #: Whether they start at the beginning of the records.
     from_start: bool
 
 
 def parts_of(records: Sequence[Record], most: int) -> Parts:
-    """Return parts with at most this number of samples in all."""
+    """Return parts with at most this number of samples in total."""
     found = [_part(record, most // len(records)) for record in records]
     return Parts([record for record, _ in found], all(from_start for _, from_start in found))
 
@@ -39,7 +39,7 @@ def _part(record: Record, most: int) -> tuple[Record, bool]:
         return beginning(record, most), True
     signal = record.input
     if input_moves(record).kind in ("constant", "steps") or not np.array_equal(signal.t, record.t):
-        # Seldom does anything happen, and all of it must be seen.
+        # The input changes rarely, and all changes are needed.
         moves = np.append(True, np.diff(signal.values) != 0) | (signal.hold != "zoh")
         held = HeldSignal(signal.t[moves], signal.values[moves], signal.hold)
         return Record(record.t[::thinned], record.y[::thinned], held, name=record.name), True

@@ -1,4 +1,4 @@
-"""What the facts on a record mean: a sentence for each, with its level."""
+"""Facts on a record in sentences, each with its level."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ctid_cli.inference.response_test import LEVEL as NO_RESPONSE
 from ctid_cli.text import count, listed, probability
 
 Level = Literal["ok", "note", "warning", "problem"]
-#: From the best to the worst.
+#: Levels from the best to the worst.
 LEVELS: tuple[Level, ...] = ("ok", "note", "warning", "problem")
-#: An irregular clock is regular but for jitter where the standard deviation of its intervals is below this fraction.
+#: An irregular clock counts as regular with jitter if the standard deviation of its intervals is below this fraction.
 JITTER = 0.05
-#: Below this order of excitation no model with a delay can be told from one without.
+#: Below this order of excitation a model with a delay cannot be distinguished from one without.
 ENOUGH_ORDER = 4
 
 
@@ -36,13 +36,13 @@ def findings(facts: RecordFacts, time: str, input: str, output: str) -> list[Fin
 
 
 def _needed(low: float, high: float, digits: int) -> int:
-    """Digits by which the ends of a narrow range differ, and at least as many as are given."""
+    """Return the number of digits by which the ends of a narrow range differ, at least ``digits``."""
     size, width = max(abs(low), abs(high)), high - low
     return digits + max(math.floor(math.log10(size / width)) - 1, 0) if 0.0 < width < math.inf else digits
 
 
 def _digits(x: float, digits: int) -> str:
-    """Rounded, without an exponent that is not needed."""
+    """Return a rounded number without an unneeded exponent."""
     return f"{float(f'{x:.{digits}g}'):.12g}"
 
 
@@ -183,7 +183,7 @@ class _Sentences:
         return f"{_digits(estimate.value, digits)} {unit}".rstrip() + f" ({ends})"
 
     def _tests(self) -> Iterator[Finding]:
-        """What stands beside the response, and what of it is not detected."""
+        """Yield the components besides the response, and those not detected."""
         parts = self.facts.parts
         if parts.offset is None or parts.drift is None or parts.start is None:
             return

@@ -1,4 +1,4 @@
-"""Changes of a fit that are tried on its own records, and those of them that help."""
+"""Changes of a fit that are tried on its own records, and selection of those that help."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -25,21 +25,21 @@ from ctid_cli.signals.held import Hold, regular_interval
 from ctid_cli.signals.record import Record, beginning
 from ctid_cli.signals.treatment import Holds, Offset
 
-#: Samples of all records on which changes are tried.
+#: Most samples of all records on which changes are tried.
 MOST_SAMPLES = 10_000
-#: Least fall of the criterion where it alone decides, very strong evidence by Kass and Raftery (1995).
+#: Least decrease of the criterion if it alone decides, very strong evidence by Kass and Raftery (1995).
 DECISIVE = 10.0
-#: There, the end of the records must not be fitted worse by more than this factor of the squared error.
+#: In that case the squared error at the end of the records may grow by at most this factor.
 NO_WORSE = 1.1
-#: Changes of one kind that are compared on blocks that are held back, and most changes that are named.
+#: Most changes of one kind that are compared on held-back blocks, and most changes that are reported.
 MOST_COMPARED, MOST_NAMED = 5, 3
-#: Delays are tried up to this fraction of the shortest record, and this many times the greatest that was searched.
+#: Delays are tried up to this fraction of the shortest record, or this multiple of the greatest that was searched.
 LATEST, FARTHER = 0.1, 2.0
-#: Rates of a pole that is added, from three periods of the record to the sampling rate, and delays of starts.
+#: Number of rates of an added pole, from 3 / duration to the sampling rate, and of starting delays.
 RATES, DELAYS = 4, 12
-#: Costs that differ by less than this fraction are those of one model.
+#: Costs that differ by less than this fraction belong to the same model.
 SAME = 1e-6
-#: Damping of a pair that is added.
+#: Damping of an added pole pair.
 DAMPING = 0.3
 
 #: Estimators of sums of submodels.
@@ -54,23 +54,23 @@ class Remedy:
     kind: Kind
     #: Options of ``ctid fit`` that make the change.
     option: str
-    #: The changed estimator, and the input between its samples.
+    #: The changed estimator, and the hold of the input.
     options: Options
     hold: Holds
-    #: Fit of blocks that were held back without and with the change, and standard error of the difference [%]; or the
-    #: criterion [-], and NaN.
+    #: Fit of held-back blocks without and with the change, and standard error of the difference [%]; or the criterion
+    #: [-], and NaN.
     before: float
     after: float
     standard_error: float
     held_back: bool
     #: Fit of all samples without and with the change [%].
     fits: tuple[float, float]
-    #: Whether the remedies before it are made too.
+    #: Whether it is combined with the remedies before it.
     besides: bool = False
 
     @property
     def gain(self) -> float:
-        """Points of fit that the change gives [%]."""
+        """Increase of the fit by the change [%]."""
         return self.after - self.before if self.held_back else self.fits[1] - self.fits[0]
 
     def __str__(self) -> str:
@@ -93,38 +93,38 @@ class Trial:
 
     @property
     def parameters(self) -> int:
-        """Number of free parameters, those that have run to infinity included."""
+        """Number of free parameters, including those at infinity."""
         return self.fit.theta.size - len(self.fit.known) + self.fit.poles_at_infinity
 
     @property
     def near(self) -> Near:
-        """Where its model is."""
+        """Denominator and delay of its model."""
         return near_model(self.fit.model, self.options.integrators)
 
     @property
     def starts(self) -> tuple[Near, ...]:
-        """Where the search for a changed estimate begins."""
+        """Starts of the search for a changed estimate."""
         return (self.near,) if isinstance(self.options, DelayProfile) else ()
 
     @property
     def rates(self) -> Array:
-        """Rates of poles [rad/s] that the records can show."""
+        """Rates of poles [rad/s] that the records can resolve."""
         longest = max(record.duration for record in self.records)
         shortest = min(float(np.median(np.diff(record.t))) for record in self.records)
         return np.geomspace(3.0 / longest, 1.0 / shortest, RATES)
 
     @cached_property
     def errors(self) -> list[Array]:
-        """Errors of the blocks that are held back."""
+        """Output errors of held-back blocks."""
         return held_back_errors(self.options, self.records, self.near)
 
 
 class Trials(NamedTuple):
-    """What was tried of a fit."""
+    """Changes of a fit that were tried."""
 
-    #: Changes that help, each besides those before it.
+    #: Changes that help, each combined with those before it.
     remedies: list[Remedy]
-    #: Options of those that do not.
+    #: Options of changes that do not.
     without_gain: list[str]
 
 
@@ -136,21 +136,21 @@ def tried_remedies(
     suspicious: bool = True,
     response: bool = True,
 ) -> Trials:
-    """Try changes of a fit on its records, and return those that help, each besides those before it.
+    """Try changes of a fit on its records, and return those that help, each combined with those before it.
 
-    There are at most three, one of each kind: another loss where there are outliers, then what helps most. Structures,
-    delays and holds are tried where the residuals or the search give a cause, and delays alone where no response to the
-    input is seen. Of submodels the criterion decides.
+    There are at most three, one of each kind: another loss if there are outliers, then the most helpful change.
+    Structures, delays and holds are tried if the residuals or the search give a reason, and delays alone if no response
+    to the input is detected. For submodels the criterion decides.
 
-    A change helps if three things hold. Schwarz's criterion of the innovations is less with it, under one noise model
+    A change helps if three conditions hold. It lowers Schwarz's criterion of the innovations, under one noise model
     (autoregressive, of the residuals of the closer fit) and 1.5 times the usual penalty. It improves the fit of ten
-    blocks of the records, each predicted by a fit that did not see its outputs, by more than twice the standard error
-    of the difference. And it does not make the fit of the last two worse, which are held back together, so that a fit
-    extrapolates. Another loss is judged by the second alone. Where blocks are too short, or the input moves in too few
-    of them, the criterion decides, if it falls by ten.
+    blocks of the records, each predicted by a fit without its outputs, by more than twice the standard error of the
+    difference. And it does not worsen the fit of the last two, which are held back together, so that a fit
+    extrapolates. For another loss only the second counts. If blocks are too short, or the input moves in too few of
+    them, the criterion decides, and must decrease by ten.
     """
     if isinstance(options, LoopOutputError):
-        # Changes are judged by what the input explains, and here it is not what drives the loop.
+        # Changes are compared by the response to the input, but here the reference drives the loop.
         return Trials([], [])
     submodels = isinstance(options, SUMS)
     # A record in a loop cannot be cut.
@@ -176,7 +176,7 @@ def tried_remedies(
 def outliers_of(
     records: Sequence[Record], options: DelayProfile | AdditiveOutputError, fit: MeasuredFit
 ) -> list[BoolArray]:
-    """Return which samples of each record are outliers, if another loss helps; else none."""
+    """Return the outliers of each record if another loss helps, else none."""
     wild = [_outliers(fit, k) for k in range(len(records))]
     found = Trials([], [])
     if any(off.any() for off in wild):
@@ -188,7 +188,7 @@ def outliers_of(
 def _best_step(
     base: Trial, wild: Sequence[Array], kinds: Sequence[Kind], found: Trials
 ) -> tuple[Trial, tuple[Kind, ...]]:
-    """Add the change of some kinds that helps most; return its fit, and the other kinds that help by themselves."""
+    """Add the most helpful change of some kinds; return its fit, and the other kinds that help on their own."""
     step = _Step(base, wild)
     helpful = step.helpful(kinds)
     if not found.remedies:
@@ -200,12 +200,12 @@ def _best_step(
     return trial, tuple(other.kind for other, _ in helpful if other is not remedy)
 
 
-# --- what is tried -----------------------------------------------------------------------------------
+# --- changes to try ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Change:
-    """An estimator and a hold, and where the search for their estimate begins."""
+    """An estimator and a hold, with starts of the search."""
 
     options: Any
     hold: Holds
@@ -223,7 +223,7 @@ def _changed(base: Trial, starts: Sequence[Near] = (), **fields: object) -> Iter
 
 
 def _structures(base: Trial) -> Iterator[Change]:
-    """One and two more poles, more zeros, an integrator besides or in the place of a pole."""
+    """Yield one and two more poles, more zeros, and an integrator, added or replacing a pole."""
     options = base.options
     if options.fixed or base.fit.poles_at_infinity:
         return
@@ -243,7 +243,7 @@ def _structures(base: Trial) -> Iterator[Change]:
 
 
 def _submodels(base: Trial) -> Iterator[Change]:
-    """One more pole of the first submodel, or one more submodel."""
+    """Yield one more pole of the first submodel, and one more submodel."""
     first, *others = base.options.terms
     yield from _changed(base, terms=(replace(first, poles=first.poles + 1), *others))
     if base.options.factored:
@@ -252,7 +252,7 @@ def _submodels(base: Trial) -> Iterator[Change]:
 
 
 def _with_fewer(denominator: Array, delay: float) -> list[Near]:
-    """Denominators without one of their real poles, or of a pair with a real pole of its size."""
+    """Return denominators without one real pole, or with a real pole of the same size in place of a pair."""
     poles = np.roots(denominator)
     found = []
     for pole in poles[poles.imag >= 0.0].tolist():
@@ -263,7 +263,7 @@ def _with_fewer(denominator: Array, delay: float) -> list[Near]:
 
 
 def _delays(base: Trial) -> Iterator[Change]:
-    """A range of delays from zero to a tenth of the record."""
+    """Yield a range of delays from zero to a tenth of the record."""
     if isinstance(base.options, MeasuredSubmodels):
         return
     denominator, _ = base.near
@@ -275,7 +275,7 @@ def _delays(base: Trial) -> Iterator[Change]:
 
 
 def _holds(base: Trial) -> Iterator[Change]:
-    """The other holds; steps show their shape themselves, and an input that jumps is not band-limited."""
+    """Yield the other holds; none for steps, whose hold is visible, nor a band-limited one for an input that jumps."""
     kinds = {input_moves(record).kind for record in base.records}
     # A discrete controller holds its input.
     if kinds <= {"constant", "steps"} or any(record.loop is not None for record in base.records):
@@ -287,12 +287,12 @@ def _holds(base: Trial) -> Iterator[Change]:
 
 
 def _treatments(base: Trial) -> Iterator[Change]:
-    """An initial state, an offset, both, and a drift."""
+    """Yield an initial state, an offset, both, and a drift."""
     options, starts = base.options, base.starts
     offsets: tuple[Offset, ...] = ("remove",)
     if isinstance(options, DelayProfile):
         offsets = ("estimate", "drift")
-        # What was left out may have moved the poles far away.
+        # The missing treatment may have moved the poles far away.
         starts += tuple((polynomial(np.full(options.poles, -rate)), base.near[1]) for rate in base.rates)
     state = "estimate" if options.initial_state == "rest" else options.initial_state
     for offset in dict.fromkeys((options.offset, *offsets)):
@@ -309,7 +309,7 @@ def polynomial(roots: Array) -> Array:
 
 
 def _losses(base: Trial) -> Iterator[Change]:
-    """A loss on which outliers leave no mark."""
+    """Yield a loss that outliers do not affect."""
     if base.options.loss == "squares":
         yield from _changed(base, loss="tukey")
 
@@ -323,7 +323,7 @@ CHANGES: dict[Kind, Callable[[Trial], Iterator[Change]]] = {
 }
 
 
-# --- how it is judged --------------------------------------------------------------------------------
+# --- assessment --------------------------------------------------------------------------------------
 
 
 class _Step:
@@ -353,7 +353,7 @@ class _Step:
         return found
 
     def _tried(self, kind: Kind, change: Change) -> Trial | None:
-        """Return the fit with a change; None where it is refused."""
+        """Return the fit with a change; None if it is refused."""
         records = tuple(with_hold(record, change.hold) for record in self.base.records)
         try:
             fit = change.options._refine(records, *change.starts) if self.able else change.options.fit(records)
@@ -362,7 +362,7 @@ class _Step:
         return Trial(kind, change.options, change.hold, records, fit)
 
     def _fall(self, trial: Trial) -> float:
-        """Fall of the criterion; of another loss, to which it does not apply, 1."""
+        """Return the decrease of the criterion; 1 for another loss, to which it does not apply."""
         if trial.kind == "loss":
             return 1.0
         before, after = self._criteria(trial)
@@ -372,7 +372,7 @@ class _Step:
         return criteria([self.base.fit, trial.fit], [self.base.parameters, trial.parameters], self.wild)
 
     def _judged(self, trial: Trial) -> Remedy | None:
-        """Return a change with what it gives; None where it does not help."""
+        """Return a change as a remedy; None if it does not help."""
         try:
             if not self.able:
                 return self._by_criterion(trial)
@@ -381,14 +381,14 @@ class _Step:
         except CtidError:
             return None
         if self.blocks or trial.kind == "loss":
-            # Outliers bend a fit everywhere; what else is wrong must show where a fit extrapolates, too.
+            # Outliers affect the fit of all blocks; other faults must also show where a fit extrapolates.
             if not gain.helps or (trial.kind != "loss" and gain.end > 1.0):
                 return None
             return self._remedy(trial, gain.before, gain.after, gain.standard_error, held_back=True)
         return self._by_criterion(trial) if gain.end < NO_WORSE else None
 
     def _searched(self, remedy: Remedy, trial: Trial) -> tuple[Remedy, Trial] | None:
-        """Return a change with what the search of the fit itself gives; None where that does not help."""
+        """Return a remedy with the full search of its estimator; None if it then does not help."""
         if trial.kind in ("loss", "hold") or not self.able:
             return remedy, trial
         fit = replace(trial.options, covariance="white").fit(trial.records)
@@ -408,13 +408,13 @@ class _Step:
         return Remedy(*made, before, after, error, held_back, fits)
 
     def _option(self, trial: Trial) -> str:
-        """Return the options that make a change."""
+        """Return the options of a change."""
         words = [typed(self.base.options, trial.options), f"--hold {trial.hold}" * (trial.hold != self.base.hold)]
         return " ".join(word for word in words if word)
 
 
 def _simplest(helpful: Sequence[tuple[Remedy, Trial]]) -> tuple[Remedy, Trial]:
-    """Return the simplest of the changes that are not worse than the best by more than a standard error."""
+    """Return the simplest of the changes within a standard error of the best."""
     if not helpful[0][0].held_back:
         return max(helpful, key=lambda pair: pair[0].before - pair[0].after)
     best = max((remedy for remedy, _ in helpful), key=lambda remedy: remedy.after)
@@ -423,9 +423,9 @@ def _simplest(helpful: Sequence[tuple[Remedy, Trial]]) -> tuple[Remedy, Trial]:
 
 
 def criteria(fits: Sequence[MeasuredFit], parameters: Sequence[int], wild: Sequence[Array]) -> list[float]:
-    """Schwarz's criterion of the innovations of each fit at the samples that all of them use, under one noise model.
+    """Return Schwarz's criterion of the innovations of each fit at common samples, under one noise model.
 
-    ``wild`` is how far outliers are from their neighbours, which does not count.
+    ``wild``, the distances of outliers from their neighbours, is subtracted.
     """
     masks = [np.logical_and.reduce(uses) for uses in zip(*(fit.used for fit in fits), strict=True)]
     models = []
@@ -438,7 +438,7 @@ def criteria(fits: Sequence[MeasuredFit], parameters: Sequence[int], wild: Seque
 
 
 def _outliers(fit: MeasuredFit, k: int) -> Array:
-    """How far outliers of a record are from their neighbours [output unit], 0 for all other samples, shape (N,)."""
+    """Return the distance of outliers from their neighbours [output unit], 0 at all other samples, shape (N,)."""
     law = fit.linear
     places, off = residual_outliers(law.residuals[k])
     found = np.zeros(law.used[k].size)
@@ -447,7 +447,7 @@ def _outliers(fit: MeasuredFit, k: int) -> Array:
 
 
 def typed(old: Any, new: Any) -> str:
-    """Options of ``ctid fit`` that turn one estimator into another."""
+    """Return the options of ``ctid fit`` that turn one estimator into another."""
     words = []
     if isinstance(new, SUMS) and old.terms != new.terms and new.factored:
         words.append(f"--terms {terms_text(new.terms)}")

@@ -1,4 +1,4 @@
-"""What is said of each choice: the criterion against the runner-up."""
+"""Sentences on each choice, with its criterion and that of the runner-up."""
 
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.identification import Options
@@ -7,13 +7,13 @@ from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking, Searched
 from ctid_cli.text import count, listed
 
-#: What is said where the beginning of a record is not looked at.
+#: Sentence if the beginning of a record is not used.
 STATE_OF_PART = (
     "State before the record: estimated (--initial-state estimate); the choice is made on a part of this long record."
 )
 
 
-#: What is said where an integrator is no candidate.
+#: Sentence if no integrator is tried.
 NO_INTEGRATOR = (
     "Integrators: not tried, as the input changes at the beginning only, where the response of an integrator is that "
     "of a drift (--integrators 1 --offset none tries one)."
@@ -21,7 +21,7 @@ NO_INTEGRATOR = (
 
 
 def spelled(options: Options) -> str:
-    """Return a structure in words: poles, zeros and integrators, of each submodel if there are several."""
+    """Return a structure in words: poles, zeros and integrators, for each submodel if there are several."""
     if not isinstance(options, MeasuredSubmodels | AdditiveOutputError) or not options.factored:
         zeros = count(options.zeros, "zero") if options.zeros else "no zero"
         own = [one for one in getattr(options, "inputs", None) or () if one.zeros is not None]
@@ -39,13 +39,13 @@ def _integrators(number: int) -> str:
 
 
 def of_outliers(number: int) -> str:
-    """Return the loss that was chosen for outliers."""
+    """Describe the loss chosen for outliers."""
     what = "1 output sample is an outlier" if number == 1 else f"{number} output samples are outliers"
     return f"Loss: tukey (--loss), as {what}; all else is chosen without {'it' if number == 1 else 'them'}."
 
 
 def rest_assumed(options: Searched) -> str:
-    """Return that no other state could be tried."""
+    """State that rest is assumed."""
     level = "its first value" if options.input_before == "first" else f"{options.input_before or 0:g}"
     return (
         f"State before the record: at rest with the input at {level}, which is assumed: the input does not change "
@@ -54,7 +54,7 @@ def rest_assumed(options: Searched) -> str:
 
 
 def of_state(rest: Candidate, estimated: Candidate, likely: bool) -> str:
-    """Return the state, and by how much it is better than the other."""
+    """Describe the state, and by how much it is better than the other."""
     if not likely:
         return (
             "State before the record: estimated, as the first samples are not those of a system at rest "
@@ -78,7 +78,7 @@ def _typed(before: object) -> str:
 
 
 def of_offset(models: Ranking) -> str:
-    """Return the treatment of the offset."""
+    """Describe the treatment of the offset."""
     other = models.runner_up("offset")
     return (
         f"Offset: {models.best.options.offset} (--offset); "
@@ -87,13 +87,13 @@ def of_offset(models: Ranking) -> str:
 
 
 def of_hold(models: Ranking) -> str:
-    """Return the hold."""
+    """Describe the hold."""
     other = models.runner_up("hold")
     return f"Hold: {models.best.hold} (--hold); {_below(models, other, '' if other is None else str(other.hold))}."
 
 
 def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
-    """Return the structure and the range of the delay."""
+    """Describe the structure and the range of the delay."""
     best = ranking.best
     other = ranking.runner_up("poles", "zeros", "integrators")
     found = []
@@ -103,14 +103,14 @@ def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_un
 
 
 def of_range(delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
-    """Return the range of the delay where it was chosen."""
+    """Describe the range of the delay if it was chosen."""
     if given.delays_given is not None:
         return []
     return [f"Delay: searched from 0 to {delays[1]:g} {time_unit} (--delay)."]
 
 
 def _too_large(ranking: Ranking) -> list[str]:
-    """Return why the structure of least criterion was not chosen, where it predicts badly."""
+    """Explain why the structure of least criterion was not chosen, if it predicts poorly."""
     larger = [each for each in ranking.candidates if not each.stands and each.unseen == each.unseen]
     if not larger:
         return []
@@ -123,7 +123,7 @@ def _too_large(ranking: Ranking) -> list[str]:
 
 
 def of_criterion(ranking: Ranking) -> str:
-    """Return the criterion."""
+    """Describe the criterion."""
     order = ranking.noise.order
     noise = f"one autoregressive noise model of order {order}" if order else "white noise"
     return f"Criterion: BIC of the innovations with {noise} for all, each parameter counted {PENALTY:g} times."

@@ -1,4 +1,4 @@
-"""Models on a record that they were not estimated from, with a state and an offset of its own."""
+"""Models on a record from which they were not estimated, with its own state and offset."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from ctid_cli.signals.treatment import Offset
 
 
 def laid_out_for(record: Record, options: Searched, given: Given) -> list[tuple[Searched, MeasuredRecords]]:
-    """Lay a record out in all treatments of state and offset that it may need; a DataError where it cannot be used."""
+    """Prepare a record in all treatments of state and offset to compare; a DataError if it cannot be used."""
     offsets: list[Offset] = ["estimate", "none"] if given.offset is None else [given.offset]
     tried = [
         replace(options, initial_state=state, input_before=before, offset=offset)
@@ -27,7 +27,7 @@ def laid_out_for(record: Record, options: Searched, given: Given) -> list[tuple[
 
 
 def judged_on(record: Record, options: Searched, fit: MeasuredFit, given: Given) -> Validation:
-    """Judge a model in the treatment that the criterion of the choice prefers on a record, the model being fixed."""
+    """Assess a fixed model on a record, in the treatment that the criterion prefers."""
     tried = laid_out_for(record, options, given)
     applied = [own._applied(fit, laid_out) for own, laid_out in tried]
     common = np.logical_and.reduce([each.used[0] for each in applied])

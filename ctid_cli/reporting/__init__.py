@@ -1,1 +1,1 @@
-"""Tables, exports and texts made from stored results."""
+"""Tables, exports and texts of stored results."""

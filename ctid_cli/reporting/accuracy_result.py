@@ -1,4 +1,4 @@
-"""The result of ``ctid accuracy``: standard errors that the estimators of an experiment can reach."""
+"""Result of ``ctid accuracy``: standard errors that the estimators of an experiment can reach."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ctid_cli.running.plan import Plan
 from ctid_cli.running.theory import expectations
 from ctid_cli.text import count, listed
 
-#: On what all of it rests.
+#: Assumptions of all standard errors.
 REMARK = (
     "This is to first order in the noise, where the estimator converges to the right solution; it takes the noise to "
     "be as specified and the system to be at rest, and does not count initial states and offsets."
@@ -25,31 +25,31 @@ REMARK = (
 
 @dataclass(frozen=True, eq=False)
 class AccuracyResult(Result):
-    """Expected accuracy of all estimators of an experiment, and what its stored results show beside it."""
+    """Expected accuracy of all estimators of an experiment, compared with its stored results."""
 
     schema = "ctid-accuracy-1"
 
     experiment: str
-    #: Of each estimator, setting and number of samples: the standard errors by theory and their formula, or the reason
+    #: For each estimator, setting and number of samples: the standard errors by theory and their formula, or the reason
     #: why there are none.
     estimates: Sequence[Mapping[str, Any]]
     #: Number of combinations of swept settings that are not shown.
     left_out: int
-    #: None where no setting has enough stored data sets for a comparison.
+    #: None if no setting has enough stored data sets for a comparison.
     surprises: Sequence[str] | None
     #: Greatest number of stored data sets of a setting; 0 without results.
     data_sets: int = 0
 
     @classmethod
     def of(cls, plan: Plan, results: Results | None = None) -> AccuracyResult:
-        """Return the expected accuracy of every estimator of an experiment, and what its results show beside it."""
+        """Return the expected accuracy of every estimator of an experiment, compared with its results."""
         estimates, left_out = expectations(plan)
         most = 0 if results is None else max(cell["replicates"] for cell in results.manifest["data_cells"])
         found = surprises(results) if results is not None and most >= FEWEST else None
         return cls(plan.experiment, estimates, left_out, found, most)
 
     def sections(self) -> list[Section]:
-        """Return tables of standard errors, the formulas that they come from, and what is unexpected."""
+        """Return tables of standard errors, their formulas, and unexpected results."""
         frame = pd.DataFrame(self.estimates).assign(
             where=[_words(each["settings"]) for each in self.estimates], title=[_title(each) for each in self.estimates]
         )
@@ -96,7 +96,7 @@ class AccuracyResult(Result):
 
 
 def _tables(known: pd.DataFrame) -> Iterator[Section]:
-    """Return one table for each estimator and setting, and one for estimators that can do the same."""
+    """Yield one table for each estimator and setting, and one for estimators of the same accuracy."""
     same: dict[tuple[str, str], tuple[Section, list[str]]] = {}
     for (where, title), members in known.groupby(["where", "title"], sort=False):
         table = _table(members.sort_values("samples", kind="stable").to_dict("records"))
@@ -106,7 +106,7 @@ def _tables(known: pd.DataFrame) -> Iterator[Section]:
 
 
 def _table(entries: Sequence[Mapping[Any, Any]]) -> Section:
-    """Return parameters down and numbers of samples across; the last columns are about the greatest number."""
+    """Return parameters down and numbers of samples across; the last columns are for the greatest number."""
     last = pd.DataFrame(entries[-1]["parameters"])
     columns: dict[str, Any] = {"parameter": last["name"], "true value": last["value"]}
     columns |= {f"N = {e['samples']}": [row["standard_error"] for row in e["parameters"]] for e in entries}
@@ -117,7 +117,7 @@ def _table(entries: Sequence[Mapping[Any, Any]]) -> Section:
 
 
 def _formula(formula: str, entries: pd.DataFrame) -> str:
-    """Return a formula with the numbers of samples and the estimators that it is for."""
+    """Return a formula with the numbers of samples and the estimators for which it holds."""
     sizes = ", ".join(map(str, sorted(set(entries["samples"]))))
     scaling = " Standard errors fall with the square root of N." if entries["scales"].iloc[0] else ""
     return f"{listed(entries['estimator'])}, N = {sizes}: {formula}.{scaling}"

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def frame_bytes(frame: pd.DataFrame) -> bytes:
-    """Return the CSV file of a table, with an empty field where there is no finite number, and 0 or 1 for a boolean."""
+    """Return the CSV file of a table: an empty field for a missing or infinite number, 0 or 1 for a boolean."""
     numbers = frame.astype({name: int for name, kind in frame.dtypes.items() if kind == np.bool_})
     text = numbers.replace([np.inf, -np.inf], np.nan).to_csv(index=False, float_format="%.12g", lineterminator="\n")
     return str(text).encode()

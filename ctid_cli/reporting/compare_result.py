@@ -1,4 +1,4 @@
-"""The result of ``ctid compare``: stored fits on the same samples of one record."""
+"""Result of ``ctid compare``: stored fits on the same samples of one record."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from ctid_cli.storage.fit_file import StoredFit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: What is told of the tests of residuals.
+#: Reported fields of the tests of residuals.
 TESTS = (("white", "whiteness_p_value"), ("uncorrelated", "cross_p_value"))
 VERDICTS = [key for pair in TESTS for key in pair]
-#: What the columns of the table mean.
+#: Meaning of the columns of the table.
 MEANING = (
     "fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x. white, independent: whether the residuals "
     "are white, and independent of the input; p is the probability of residuals farther from that."
@@ -34,8 +34,8 @@ MEANING = (
 
 
 def short_names(files: Sequence[Path]) -> list[str]:
-    """Return file names where they differ, with folders where they do not."""
-    # A file that is called fit.json, as most are, goes by its folder.
+    """Return file names if they differ, otherwise with folders."""
+    # Most fits are called fit.json, and named by their folder.
     parts = [file.parts[:-1] if file.name == "fit.json" and file.parts[:-1] else file.parts for file in files]
     for depth in range(1, 1 + max(map(len, parts))):
         names = ["/".join(each[-depth:]).removesuffix(".json") for each in parts]
@@ -62,11 +62,11 @@ class ModelComparison(Result):
 
     @property
     def names(self) -> list[str]:
-        """Names that tell the fits apart."""
+        """Names that distinguish the fits."""
         return short_names([fit.path for fit in self.fits])
 
     def sections(self) -> list[Section]:
-        """Return the models, the best fit first, and the samples that they are compared on."""
+        """Return the models, the best fit first, and the samples on which they are compared."""
         record, one, unit = self.measurement.record, self.found[0], self.units
         every = "all" if one.count == record.n_samples else f"{one.count} of"
         samples = (
@@ -92,7 +92,7 @@ class ModelComparison(Result):
         ]
 
     def _rows(self) -> list[dict[str, Any]]:
-        """Return what is told of each model."""
+        """Return a row of the table for each model."""
         return [
             {
                 "name": name,
@@ -106,7 +106,7 @@ class ModelComparison(Result):
         ]
 
     def to_frame(self) -> pd.DataFrame:
-        """Return the measured output, and that of each model, at the samples that all of them have."""
+        """Return the measured output, and that of each model, at common samples."""
         units, first = self.units, self.found[0]
         columns = {f"t [{units.time}]": first.t, units.label("measured", units.output): first.measured}
         for name, one in zip(self.names, self.found, strict=True):
@@ -145,5 +145,5 @@ class ModelComparison(Result):
 
 
 def _verdict(passed: bool | None, p_value: float | None) -> bool | None:
-    """Return whether a test is passed, None where it could not be made."""
+    """Return whether a test is passed, None if it could not be made."""
     return None if p_value is None or np.isnan(p_value) else passed

@@ -1,4 +1,4 @@
-"""Percentages beside those that are committed and those of the article: do they differ by more than chance?"""
+"""Significance tests of percentages against the committed tables and the article."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from ctid_cli.reporting.study_table import build_tables, committed_tables, made_
 from ctid_cli.reporting.table_result import labels_of
 from ctid_cli.text import count, listed
 
-#: Chance that a check reports any difference although nothing has changed.
+#: Probability that a check reports any difference although nothing has changed.
 LEVEL = 0.01
-#: Chance that a difference as large as the one that is called detectable is reported.
+#: Probability that a difference reported as detectable is found.
 POWER = 0.8
-#: What a comparison adds to the keys of a cell.
+#: Columns that a comparison adds to the keys of a cell.
 COMPARED = (
     *("against", "n", "converged", "percent", "reference_n", "reference_converged", "reference_percent"),
     *("p_value", "adjusted_p_value", "detectable", "differs", "decisive", "mismatch"),
@@ -51,7 +51,7 @@ class ComparisonResult(Result):
 
     @property
     def mismatches(self) -> pd.DataFrame:
-        """Those of them that differ."""
+        """Decisive comparisons that differ."""
         return self.cells[self.cells["mismatch"]]
 
     @property
@@ -63,7 +63,7 @@ class ComparisonResult(Result):
 
     @property
     def verdict(self) -> str:
-        """How many comparisons differ, in one sentence."""
+        """Sentence with the number of comparisons that differ."""
         wrong, compared = len(self.mismatches), count(len(self.decisive), "comparison")
         if not wrong:
             return f"No difference beyond sampling error in {compared}"
@@ -89,7 +89,7 @@ class ComparisonResult(Result):
         return self.cells
 
     def sections(self) -> list[Section]:
-        """Return what was found, and the cells that differ."""
+        """Return a summary, and the cells that differ."""
         wrong = self.mismatches
         information = "For information, differences from the paper that are no mismatch (reasons: the study's README):"
         parts = {
@@ -102,7 +102,7 @@ class ComparisonResult(Result):
         return [Section(sentences=[self._summary()]), *shown, *notes]
 
     def _summary(self) -> str:
-        """Return what was compared with what, by which test, and what it could have found."""
+        """Return what was compared, by which test, and which differences it could detect."""
         cells, parts = self.decisive, []
         paper = cells[cells["against"] == "paper"]
         if len(paper) < len(cells):
@@ -149,10 +149,10 @@ def compare(
     """Compare cells of tables with committed ones and with the article.
 
     Cells are the same if experiment, method, initial delay and swept fields are. Each pair of counts is tested with
-    Fisher's exact test, conditional on the sum of successes: it holds its level for any number of data sets. Holm's
-    correction keeps the chance of any false difference among all decisive cells at 1 %, however they depend on each
-    other. Where both sides used the same seed they share their data sets, so they agree even better than the test
-    assumes. The comparisons for information are a family of their own.
+    Fisher's exact test, conditional on the sum of successes, which holds its level for any number of data sets. Holm's
+    correction limits the probability of any false difference among all decisive cells to 1 %, however they depend on
+    each other. With the same seed both sides share their data, and agree even better than assumed. The comparisons for
+    information are corrected separately.
     """
     known = rows.iloc[:0] if committed is None else committed
     settings = list(dict.fromkeys([*settings_of(rows), *settings_of(known)]))
@@ -176,7 +176,7 @@ def compare(
 
 
 def _keyed(frame: pd.DataFrame, settings: Sequence[str]) -> pd.DataFrame:
-    """Return each cell once, with what makes two cells the same one whichever table shows it as ``key``."""
+    """Return each cell once, with an identifier ``key`` that does not depend on the table."""
     names = ["experiment", "method", "initial_delay", *settings]
     frame = frame.reindex(columns=list(dict.fromkeys([*frame.columns, *names, "published_percent"])))
     keys = [json.dumps([_same(value) for value in row.values()]) for row in records_of(frame[names])]
@@ -184,12 +184,12 @@ def _keyed(frame: pd.DataFrame, settings: Sequence[str]) -> pd.DataFrame:
 
 
 def _same(value: Any) -> Any:
-    """Return a number as it is whether it comes from a file or from results."""
+    """Return a number in one form for files and results."""
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
 def _tested(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return cells with their tests; from committed tables any difference decides, from the article a lower value."""
+    """Return cells with their tests; any difference from committed tables decides, from the article a lower value."""
     counts = ["converged", "n", "reference_converged", "reference_n"]
     cells = cells.astype(dict.fromkeys(counts, "int64") | {"decisive": bool})
     cells["percent"] = 100 * cells["converged"] / cells["n"]
@@ -208,7 +208,7 @@ def _tested(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def _power(cells: pd.DataFrame) -> str:
-    """Return what the comparisons could have found."""
+    """Return which differences the comparisons could detect."""
     found = cells["detectable"].dropna()
     if found.empty:
         return "With so few data sets no difference could have been detected, however large."

@@ -1,4 +1,4 @@
-"""The result protocol: what every printed result offers, and the renderers of its sections, each written once."""
+"""Result protocol: the interface of every printed result, and the renderers of its sections."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 #: Forms in which a result is written to stdout.
 Format = Literal["text", "json", "md", "csv", "html", "latex"]
-#: Tools that a model is exported to.
+#: Tools to which a model is exported.
 Tool = Literal["control", "matlab", "scipy"]
 
 
@@ -36,7 +36,7 @@ class Column(NamedTuple):
     """A quantity of a result: its key in JSON and its unit, and its title and format in tables."""
 
     key: str
-    #: The name of the column of a file, where it is empty.
+    #: Name of the column of a file, if it is not ``key``.
     title: str = ""
     form: str = ".6g"
     unit: str = ""
@@ -59,19 +59,19 @@ class Section:
     title: str = ""
     sentences: Sequence[str] = ()
     frame: pd.DataFrame | None = None
-    #: Format of the numbers of a column, such as ``.2f``; ``.6g`` where nothing is said.
+    #: Format of the numbers of a column, such as ``.2f``; ``.6g`` by default.
     formats: Mapping[str, str] = field(default_factory=dict)
-    #: Lines that are never wrapped, because they hold paths or commands.
+    #: Lines that are never wrapped, such as paths and commands.
     lines: Sequence[str] = ()
-    #: Sentences below the table: what its columns mean.
+    #: Sentences below the table, on the meaning of its columns.
     notes: Sequence[str] = ()
-    #: A figure that is still to be drawn, or an SVG file.
+    #: A figure to draw, or an SVG file.
     drawing: Drawing | bytes | None = None
     caption: str = ""
 
     @classmethod
     def table(cls, rows: Iterable[object], columns: Sequence[Column], **parts: Any) -> Section:
-        """Return a table of objects, or of mappings; columns of which nothing is known are left out."""
+        """Return a table of objects or mappings; columns without any value are left out."""
         import pandas as pd
 
         keys = [column.key for column in columns]
@@ -81,31 +81,31 @@ class Section:
 
 
 class Result(ABC):
-    """A result that a command prints and that Python users get: numbers, and how they are shown.
+    """A result that commands print and Python functions return: numbers, and their presentation.
 
     Subclasses are frozen dataclasses of numbers. ``content`` is the JSON of ``--format json``; all other forms are
     rendered from ``sections``.
     """
 
     #: Name and version of the JSON object, such as ``ctid-check-1``; empty for rows of a table, and for files of
-    #: results, which say their kind and format.
+    #: results, which contain their kind and format.
     schema: ClassVar[str] = ""
 
     @abstractmethod
     def sections(self) -> Sequence[Section]:
-        """Return what is shown, in order."""
+        """Return the parts to show, in order."""
 
     @abstractmethod
     def content(self) -> Any:
         """Return the result as plain data for JSON."""
 
     def json_content(self) -> Any:
-        """Return the content as it is written, with the name and version of its schema."""
+        """Return the content with the name and version of its schema."""
         content = self.content()
         return {"schema": self.schema, **content} if self.schema and isinstance(content, dict) else content
 
     def to_frame(self) -> pd.DataFrame:
-        """Return the main table of the result; one row of its content where there is none."""
+        """Return the main table of the result; one row of its content if there is none."""
         import pandas as pd
 
         frames = [section.frame for section in self.sections() if section.frame is not None]
@@ -122,7 +122,7 @@ class Result(ABC):
         return self.write("text")
 
     def write(self, form: Format = "text", columns: int | None = None) -> str:
-        """Return the result in one of the forms; text fits in the columns of a terminal, if they are given."""
+        """Return the result in one of the forms; text is wrapped to the columns of a terminal, if they are given."""
         if form == "json":
             return json.dumps(plain(self.json_content()), indent=1, allow_nan=False)
         if form == "text":
@@ -147,7 +147,7 @@ def pairs(rows: Iterable[Sequence[str]]) -> pd.DataFrame:
 
 
 def cell(value: Any, form: str = ".6g") -> str:
-    """Return a cell of a table as text: a number in its format, a dash where there is none."""
+    """Return a cell of a table as text: a number in its format, a dash if there is none."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
@@ -172,13 +172,13 @@ def aligned_lines(section: Section) -> tuple[list[list[str]], str]:
 
 
 def _is_number(text: str) -> bool:
-    """Whether a cell is a number, with its error, interval or unit, but no sentence."""
+    """Return whether a cell is a number, with its error, interval or unit, but no sentence."""
     begins = text[:1].isdigit() or (text[:1] in "-+[±" and text[1:2].isdigit())
     return text in ("", "-") or (begins and not re.search("[A-Za-z]{6}", text))
 
 
 def render_text(sections: Iterable[Section], columns: int | None = None) -> str:
-    """Render sections as text, wrapped at the width of a page or a narrower terminal, tables with aligned columns."""
+    """Render sections as text, wrapped at the page width or a narrower terminal, tables with aligned columns."""
     width = WIDTH if columns is None else min(WIDTH, columns)
     blocks = []
     for section in sections:
@@ -191,7 +191,7 @@ def render_text(sections: Iterable[Section], columns: int | None = None) -> str:
 
 
 def _paragraph(sentence: str, width: int) -> str:
-    """Wrap a sentence; one that begins with a hyphen hangs, one with line ends is drawn already."""
+    """Wrap a sentence; one that begins with a hyphen gets a hanging indent, one with line ends is left unchanged."""
     if "\n" in sentence:
         return sentence
     return wrapped(sentence, hanging="  " if sentence.startswith("- ") else "", width=width)
@@ -202,7 +202,7 @@ def _text_table(lines: list[list[str]], sides: str, columns: int | None = None) 
         width, hanging = min(WIDTH, columns or WIDTH), " " * (LABEL + 1)
         return "\n".join(wrapped(f"{label:{LABEL}} {text}", "", hanging, width) for label, text in lines[1:])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    # Columns that stand closer may fit where they would not otherwise.
+    # A smaller gap between columns may make them fit.
     gap = 1 if columns and _width(widths, 1) <= columns < _width(widths, 2) else 2
     blocks = []
     for part in _parts(widths, _key_count(lines[1:], sides), gap, columns):
@@ -213,8 +213,8 @@ def _text_table(lines: list[list[str]], sides: str, columns: int | None = None) 
 
 
 def _key_count(rows: Sequence[Sequence[str]], sides: str) -> int:
-    """Return the number of first columns that tell all rows apart; where none do, of those before the first number."""
-    # An empty cell stands for the one above it.
+    """Return the number of first columns that identify all rows; if none do, of those before the first number."""
+    # An empty cell repeats the one above it.
     told = ["" for _ in rows]
     for k, column in enumerate(zip(*rows, strict=True)):
         filled: Iterator[str] = itertools.accumulate(column, lambda above, own: own or above)
@@ -225,7 +225,7 @@ def _key_count(rows: Sequence[Sequence[str]], sides: str) -> int:
 
 
 def _parts(widths: Sequence[int], key_count: int, gap: int, columns: int | None) -> Iterator[list[int]]:
-    """Yield which columns of a table stand side by side in a terminal; those that name the rows come in every part."""
+    """Yield the columns of each part of a table that fits a terminal; those that identify rows are in every part."""
     keys = list(range(key_count))
     part = keys
     for k in range(len(keys), len(widths)):

@@ -1,4 +1,4 @@
-"""The parameters of an estimate with their uncertainty."""
+"""Parameters of an estimate with their uncertainty."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from ctid_cli.reporting.layout import picked
 
 
 def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None = None) -> list[UncertainValue]:
-    """Parameters of an estimate with their uncertainty."""
+    """Return the parameters of an estimate with their uncertainty."""
     numerator, denominator = estimate.get("numerator"), estimate.get("denominator")
     given, units = estimate.get("parameters") or {}, Units()
-    # What was stored before quantiles were has intervals of the normal distribution.
+    # Estimates stored without quantiles have intervals of the normal distribution.
     reach = estimate.get("quantiles") or {}
     errors = {name: (error, reach.get(name)) for name, error in (estimate.get("standard_errors") or {}).items()}
     if not numerator or not denominator:
@@ -29,11 +29,11 @@ def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None
     if submodels and not values.keys() & errors.keys():
         values = {}
     named = {name: units.of(name, len(denominator) - 1, len(numerator) - 1) for name in values}
-    # Integrators have the least natural frequency of all, so that they are those of the first submodel.
+    # Integrators have the least natural frequency, so they belong to the first submodel.
     integrators = next(k for k, value in enumerate(reversed(denominator)) if value != 0)
     named |= {name: units.of_submodel(name, integrators if name.startswith("g1_") else 0) for name in submodels}
     delay = estimate.get("delay")
-    # Of a custom estimator, in units that it alone knows.
+    # Parameters of a custom estimator, in unknown units.
     free = {name: "" for name in given if name not in (*named, "delay")}
     values |= {**given, "delay": delay}
     found = [_found(name, values[name], errors, unit) for name, unit in {**named, **free, "delay": units.time}.items()]
@@ -59,7 +59,7 @@ def _delay_status(delay: float | None, bounds: Sequence[float] | None) -> str:
     return "at bound" if at_bound else "free"
 
 
-#: What is told of a parameter.
+#: Reported fields of a parameter.
 PARAMETER = (
     Column("name", "parameter"),
     Column("estimate"),

@@ -1,4 +1,4 @@
-"""One stored estimate in full: the result of ``ctid export --id``."""
+"""Result of ``ctid export --id``: one stored estimate in full."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class EstimateResult(Result):
-    """One stored estimate: its parameters with their uncertainty, its status, and what it was computed from."""
+    """One stored estimate: parameters with their uncertainty, status and origin."""
 
     schema = "ctid-estimate-1"
 
@@ -33,7 +33,7 @@ class EstimateResult(Result):
     def parameters(self) -> list[UncertainValue]:
         """Parameters with their uncertainty."""
         estimator = self.found.slot.estimator
-        # A custom estimator may mean something else by the name.
+        # A custom estimator may use the name for something else.
         ours = estimator["kind"] in KINDS["estimator"]
         return parameters(self.found.row, estimator["content"].get("delay_bounds") if ours else None)
 
@@ -49,7 +49,7 @@ class EstimateResult(Result):
         }
 
     def sections(self) -> list[Section]:
-        """Return what it is, its numbers, and the data and the settings that it comes from."""
+        """Return identification, numbers, data and settings of the estimate."""
         row, seed = self.found.row, self.found.stored.manifest["seed"]
         head = [f"{row['estimator']} ({row['kind']}), data set {row['replicate']}{_start(row)}"]
         head.append(f"{row['status']}: {row['message']}")
@@ -73,7 +73,7 @@ class EstimateResult(Result):
         return pd.DataFrame(rows)
 
     def _fitted(self) -> Section:
-        """Return the parameters of a model, and what their names and intervals mean."""
+        """Return the parameters of a model, and the meaning of their names and intervals."""
         row, names = self.found.row, [item.name for item in self.parameters]
         notes = [f"True delay: {number(row['true_delay'])} s."] if row.get("true_delay") is not None else []
         if not names:
@@ -83,7 +83,7 @@ class EstimateResult(Result):
 
 
 def _facts(row: Mapping[str, Any]) -> Section:
-    """Return how well a model fits, and how it was computed."""
+    """Return the quality of fit, and details of the computation."""
     facts = {"fit": f"{number(row['fit_percent'])} % of the data that it was estimated from"}
     if row.get("validation_fit_percent") is not None:
         facts["validation fit"] = f"{number(row['validation_fit_percent'])} %"
@@ -98,7 +98,7 @@ def _facts(row: Mapping[str, Any]) -> Section:
 
 
 def _measures(row: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return what was measured of the frequencies of a signal."""
+    """Return the measures of the frequencies of a signal."""
     measures = row["measures"] or {}
     return [
         {
@@ -120,7 +120,7 @@ def _settings(content: Mapping[str, Any]) -> list[str]:
 
 
 def _interval(row: Mapping[str, Any]) -> str:
-    """Return how intervals follow from errors."""
+    """Return the formula of intervals."""
     formula, freedom = row.get("covariance"), row.get("degrees_of_freedom")
     if formula == "biased":
         return BIASED
@@ -134,7 +134,7 @@ def _interval(row: Mapping[str, Any]) -> str:
 
 
 def _conventions(names: list[str]) -> list[str]:
-    """Return what the names of parameters mean."""
+    """Return the meaning of the names of parameters."""
     if not any(name.startswith("g") for name in names):
         return ["Monic denominator, descending powers."]
     lines = ["g1: submodel of the least natural frequency; g1_a2: coefficient of p^2 in its denominator (ends in 1)."]

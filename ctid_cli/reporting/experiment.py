@@ -1,4 +1,4 @@
-"""Experiments from Python: run, read, and as tables of pandas; what the commands run and read."""
+"""Experiments from Python: running, reading, and tables of pandas."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class ExperimentResults(Results, Result):
     Parameters
     ----------
     folder : pathlib.Path
-        Where they are stored.
+        Folder in which they are stored.
     stored : Estimates
-        The estimates, as they were read.
+        The estimates that were read.
 
     See Also
     --------
@@ -52,7 +52,7 @@ class ExperimentResults(Results, Result):
 
     @property
     def table(self) -> TableResult:
-        """What ``ctid table`` prints."""
+        """Table that ``ctid table`` prints."""
         return experiment_table(self, [*notes_of(self, self.out), *self.surprises])
 
     def sections(self) -> Sequence[Section]:
@@ -64,25 +64,25 @@ class ExperimentResults(Results, Result):
         return self.table.content()
 
     def to_frame(self) -> pd.DataFrame:
-        """Return one row for each estimate, the same as ``estimates``."""
+        """Return one row for each estimate, equal to ``estimates``."""
         return self.estimates
 
     def plot(self) -> Figure:
-        """Draw the figure that tells most; ``figure`` has options."""
+        """Draw the main figure; ``figure`` has options."""
         return experiment_drawing(self).figure()
 
     @property
     def out(self) -> Path:
-        """The folder of results that this one lies in."""
+        """Results folder that contains this experiment's."""
         return self.folder.parents[len(Path(self.experiment).parts) - 1]
 
     @property
     def surprises(self) -> list[str]:
-        """What the estimates show that theory does not expect, with its reasons; empty where there is nothing."""
+        """Deviations of the estimates from theory, with their reasons; empty if there are none."""
         return unexpected.surprises(self)
 
     def measures(self, *names: str) -> pd.DataFrame:
-        """Measures with their Monte Carlo errors, what ``ctid table --measure`` prints.
+        """Return measures with their Monte Carlo errors, as ``ctid table --measure`` prints.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ class ExperimentResults(Results, Result):
         return measure_frame(self, names or default_measures(self) or ["percent"]).reset_index(drop=True)
 
     def compare(self, first: str, second: str) -> pd.DataFrame:
-        """Differences of two estimators on the same data sets, what ``ctid table --compare`` prints.
+        """Return differences of two estimators on the same data sets, as ``ctid table --compare`` prints.
 
         Parameters
         ----------
@@ -125,16 +125,16 @@ class ExperimentResults(Results, Result):
         return compare_estimators(self, f"{first},{second}", self.out).to_frame().infer_objects()
 
     def figure(self, kind: str | None = None, measure: str | None = None, parameters: Sequence[str] = ()) -> Picture:
-        """A figure of the experiment, what ``ctid figure`` draws.
+        """Return a figure of the experiment, as ``ctid figure`` draws.
 
         Parameters
         ----------
         kind : {"measure", "box"}, optional
-            What is drawn; by default what tells most.
+            Kind of figure; by default the most informative one.
         measure : str, optional
-            With ``measure``: such as ``"rmse"`` or ``"rmse:delay"``.
+            With ``measure``: the name of a measure, such as ``"rmse"`` or ``"rmse:delay"``.
         parameters : sequence of str, default ()
-            With ``box``: of which parameters; of all by default.
+            With ``box``: names of parameters; all by default.
 
         Returns
         -------
@@ -144,13 +144,13 @@ class ExperimentResults(Results, Result):
         Raises
         ------
         UsageError
-            If the experiment has nothing to draw in this way.
+            If the experiment has no such figure.
         """
         return experiment_drawing(self, kind, measure, parameters).picture()
 
 
 def read_results(folder: str | os.PathLike[str]) -> ExperimentResults:
-    """Results of an experiment that was run.
+    """Return the results of an experiment.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def read_results(folder: str | os.PathLike[str]) -> ExperimentResults:
     Returns
     -------
     ExperimentResults
-        The estimates, and what is measured of them.
+        The estimates and their measures.
 
     Raises
     ------
@@ -187,22 +187,22 @@ def run_experiment(
     allow_mixed: bool = False,
     allow_code: bool = False,
 ) -> ExperimentResults:
-    """Run an experiment, as ``ctid run`` does; the same call again computes only what is missing.
+    """Run an experiment, as ``ctid run`` does; a repeated call computes only missing estimates.
 
     Parameters
     ----------
     spec : path or mapping
         A specification: the path of a YAML file, or its content.
     out : path, default "results"
-        Folder of results; this experiment's own folder in it has its name.
+        Folder of results; this experiment has a subfolder of its name.
     jobs : int, optional
         Worker processes; all processors by default.
     runs : int, optional
-        Data sets per setting, not the specification's own number.
+        Data sets per setting, in place of the specification's number.
     overrides : sequence of str, default ()
-        Values in the place of the specification's own, such as ``"noise.snr_db=15"``.
+        Values that replace those of the specification, such as ``"noise.snr_db=15"``.
     fresh : bool, default False
-        Move older results aside and start anew.
+        Move older results aside and start again.
     allow_mixed : bool, default False
         Add to results of another version of the code or another processor.
     allow_code : bool, default False
@@ -211,16 +211,16 @@ def run_experiment(
     Returns
     -------
     ExperimentResults
-        All that is stored, also where a signal stopped the run.
+        All stored estimates, also if a signal stopped the run.
 
     Raises
     ------
     SpecError
-        If the specification has mistakes; all of them are named.
+        If the specification has mistakes; all of them are listed.
     RefusedError
         If the folder holds another experiment or results of other code, or code may not be run.
     MachineError
-        If the machine did not let estimates finish (memory, open files, killed processes); what is finished is stored.
+        If the machine prevented estimates (memory, open files, killed processes); finished ones are stored.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The numbers of a fit in the units of its records, and all of them as plain data."""
+"""Numbers of a fit in the units of its records, and as plain data."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from ctid_cli.reporting.records import Records
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Record
 
-#: What is told of a derived quantity.
+#: Reported fields of a derived quantity.
 DERIVED = (
     Column("name", "derived"),
     Column("estimate"),
@@ -92,7 +92,7 @@ def fit_content(
 
 
 def _model_object(fitted: Identification) -> dict[str, Any]:
-    """Return the model; of several inputs a transfer function for each."""
+    """Return the model; for several inputs a transfer function for each."""
     fit, additive = fitted.fit, additive_of(fitted.fit)
     if isinstance(fit, MultiInputFit):
         parts = {name: _fraction_object(part) for name, part in fit.model.parts.items()}
@@ -107,12 +107,12 @@ def _fraction_object(model: TransferFunction) -> dict[str, Any]:
 
 
 def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
-    """Parameters with the units of the records."""
+    """Return the parameters with the units of the records."""
     if isinstance(result.fit, MultiInputFit):
         return [replace(item, unit=_unit_of_input(item.name, result.fit, units)) for item in result.estimates]
     additive, poles, zeros = additive_of(result.fit), result.fit.model.order, result.options.zeros
     monic = isinstance(result.options, AdditiveOutputError)
-    # The states of a loop are those of plant and controller, in different units.
+    # The states of a loop are those of plant and controller, with different units.
     nameless = isinstance(result.fit, LoopFit)
 
     def unit(name: str) -> str:
@@ -124,7 +124,7 @@ def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
 
 
 def _unit_of_input(name: str, fit: MultiInputFit, units: Units) -> str:
-    """Unit of a parameter of a model with several inputs."""
+    """Return the unit of a parameter of a model with several inputs."""
     for k, (own, model) in enumerate(fit.model.parts.items()):
         if name.startswith(f"{own}_"):
             bare = name.removeprefix(f"{own}_")
@@ -134,12 +134,12 @@ def _unit_of_input(name: str, fit: MultiInputFit, units: Units) -> str:
 
 
 def additive_of(fit: MeasuredFit) -> AdditiveModel | None:
-    """The submodels of a fit, None of a fit of one transfer function."""
+    """Return the submodels of a fit, None for a fit of one transfer function."""
     return fit.additive if isinstance(fit, SubmodelsFit) else None
 
 
 def derived_of(result: Identification, units: Units) -> list[UncertainValue]:
-    """Derived quantities in the units of the records; frequencies that are called Hz are in Hz."""
+    """Return derived quantities in the units of the records; names that end in Hz have values in Hz."""
     names = {"s": units.time, "rad/s": f"rad/{units.time}", GAIN_UNIT: units.gain}
     found = []
     for row in result.derived:
@@ -169,7 +169,7 @@ def _covariance_object(result: Identification) -> dict[str, Any]:
 
 
 def _box_object(box: Box, held: Iterable[complex]) -> dict[str, Any]:
-    """Return the set of models in which the estimate is the best, null for no bound, and the bounds that poles met."""
+    """Return the set of admissible models, null for no bound, and the bounds that poles met."""
     return {
         "poles": (box.slowest, box.fastest),
         "imaginary_part": box.imaginary if np.isfinite(box.imaginary) else None,
@@ -183,7 +183,7 @@ def _box_object(box: Box, held: Iterable[complex]) -> dict[str, Any]:
 
 
 def _modes(fit: MeasuredFit, units: Units) -> list[dict[str, float | None]]:
-    """Natural frequency and damping of every real pole and every pair; an integrator has no damping."""
+    """Return natural frequency and damping of every real pole and every pair; an integrator has no damping."""
     seconds = units.seconds
     return [
         {"frequency_hz": None if seconds is None else frequency / seconds, "damping": damping}
@@ -220,7 +220,7 @@ def _record_object(measurement: Measurement, use: Any) -> dict[str, Any]:
 
 
 def _noise_object(fit: MeasuredFit, estimate: NoiseEstimate, predicted: Sequence[int]) -> dict[str, Any]:
-    """Return the noise model for JSON, and the output-error fit beside it."""
+    """Return the noise model for JSON, with the output-error fit."""
     errors = estimate.output_error_errors
     return {
         **picked(estimate.noise, ("numerator", "denominator", "innovation_variance")),
@@ -236,7 +236,7 @@ def _noise_object(fit: MeasuredFit, estimate: NoiseEstimate, predicted: Sequence
 
 
 def _loss_object(fit: MeasuredFit, records: Sequence[Record]) -> dict[str, Any]:
-    """The loss for JSON."""
+    """Return the loss for JSON."""
     if fit.weighting is None:
         return {"kind": "squares", "scales": None, "outliers": [[] for _ in records], "fit_percent": None}
     return {

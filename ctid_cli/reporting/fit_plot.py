@@ -1,4 +1,4 @@
-"""The figure of ``ctid fit``: output, residuals, their correlation, and the search over the delay."""
+"""Figure of ``ctid fit``: output, residuals, their correlation, and the search over the delay."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from ctid_cli.signals.measurement import Measurement
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Experiments that are drawn; more do not fit into one figure.
+#: Most experiments that are drawn in one figure.
 MOST_DRAWN = 3
-#: A profile whose greatest cost is this many times its least one has a logarithmic scale.
+#: A profile is logarithmic if its greatest cost is this many times its least one.
 STEEP = 5.0
-#: Lines of the correlations of experiments.
+#: Line styles of the correlations of experiments.
 LINES = ("o-", "s--", "^:")
 
 
@@ -36,11 +36,11 @@ class FitFigures:
 
     @property
     def drawn(self) -> int:
-        """How many experiments are drawn."""
+        """Number of experiments that are drawn."""
         return min(len(self.measurements), MOST_DRAWN)
 
     def all(self) -> Drawing:
-        """Output and residuals of each experiment, autocorrelation, and the search over the delay."""
+        """Draw output and residuals of each experiment, autocorrelation, and the search over the delay."""
         n = self.drawn
 
         def draw(figure: Figure) -> None:
@@ -52,11 +52,11 @@ class FitFigures:
         return Drawing(8.0, 3.4 * n + 2.8, draw)
 
     def outputs(self) -> Drawing:
-        """Measured and simulated output of each experiment."""
+        """Draw measured and simulated output of each experiment."""
         return self._by_experiment(self.draw_output)
 
     def residuals(self) -> Drawing:
-        """Residuals of each experiment."""
+        """Draw the residuals of each experiment."""
         return self._by_experiment(self.draw_residuals)
 
     def _by_experiment(self, part: Callable[[Any, int], None]) -> Drawing:
@@ -69,7 +69,7 @@ class FitFigures:
         return Drawing(8.0, 2.8 * self.drawn, draw)
 
     def correlations(self) -> Drawing:
-        """Correlation of the residuals, or innovations, with themselves and with the input."""
+        """Draw the correlation of the residuals, or innovations, with themselves and with the input."""
 
         def draw(figure: Figure) -> None:
             both = figure.subplots(1, 2)
@@ -81,7 +81,7 @@ class FitFigures:
     # --- panels ------------------------------------------------------------------------------------
 
     def draw_experiments(self, figure: Figure, grid: Any) -> None:
-        """Output and residuals of the first experiments, each in two rows of a grid."""
+        """Draw output and residuals of the first experiments, each in two rows of a grid."""
         for k in range(self.drawn):
             output = figure.add_subplot(grid[2 * k, :])
             self.draw_output(output, k)
@@ -93,7 +93,7 @@ class FitFigures:
             self._name_panels(output, error, k)
 
     def draw_output(self, axes: Any, k: int) -> None:
-        """The measured output of an experiment, the simulated one, and what counts for little."""
+        """Draw measured and simulated output of an experiment, and samples with a small weight."""
         record, fit = self.measurements[k].record, self.result.fit
         if fit.weighting is not None and fit.weighting.outliers[k].any():
             little = np.flatnonzero(fit.used[k])[fit.weighting.outliers[k]]
@@ -101,14 +101,14 @@ class FitFigures:
         draw_overlay(axes, self.measurements[k], fit.used[k], fit.residuals[k], self.units)
 
     def draw_residuals(self, axes: Any, k: int) -> None:
-        """The residuals of an experiment."""
+        """Draw the residuals of an experiment."""
         fit, t = self.result.fit, self.measurements[k].record.t
         axes.plot(*curve(t, fit.used[k], fit.residuals[k]), color=DARK, linewidth=0.7)
         axes.axhline(0.0, color="black", linewidth=0.6)
         name_axes(axes, y=self.units.label("residual", self.units.output))
 
     def _name_panels(self, upper: Any, lower: Any, k: int) -> None:
-        """Name the axis of time below the lower panel, and above the upper one which experiment it is."""
+        """Label the time axis of the lower panel, and the upper panel with the experiment."""
         t, n = self.measurements[k].record.t, len(self.measurements)
         thinned = f"; the least and the greatest of each {t.size // STRIPES} samples are drawn"
         label = self.units.column(self.measurements[k], "time")
@@ -117,7 +117,7 @@ class FitFigures:
             upper.set_title(f"experiment {k + 1} of {n}", loc="left")
 
     def draw_autocorrelation(self, axes: Any) -> None:
-        """Autocorrelation of the residuals, or innovations, of each experiment, with the band of white ones."""
+        """Draw the autocorrelation of the residuals or innovations of each experiment, with the band of white ones."""
         tests, several = self.result.tests[:: self._inputs], len(self.measurements) > 1
         name_axes(axes, y=f"autocorrelation\nof the {self.result.fit.left_over} [-]")
         labels = [f"experiment {k}" if several else "" for k in range(1, len(tests) + 1)]
@@ -127,7 +127,7 @@ class FitFigures:
             _draw_band(axes, tests[0].autocorrelation_band, tests[0].level, "white")
 
     def draw_cross_correlation(self, axes: Any) -> None:
-        """Correlation of the residuals of each experiment with its delayed input, or each of several."""
+        """Draw the correlation of the residuals of each experiment with its delayed input, or inputs."""
         result, tests, several = self.result, self.result.tests, len(self.measurements) > 1
         name_axes(axes, y=f"correlation of the {result.fit.left_over}\nwith the delayed {result.driver} [-]")
         labels = [test.driver if self._inputs > 1 else f"experiment {k}" * several for k, test in enumerate(tests, 1)]
@@ -138,7 +138,7 @@ class FitFigures:
 
     @property
     def delay(self) -> float:
-        """The estimated delay, of several inputs that of the first."""
+        """Estimated delay; for several inputs that of the first."""
         return fractions_of(self.result.fit.model)[0].delay
 
     @property
@@ -146,7 +146,7 @@ class FitFigures:
         return len(fractions_of(self.result.fit.model))
 
     def draw_profile(self, axes: Any) -> None:
-        """The search over the delay."""
+        """Draw the search over the delay."""
         fit, units = self.result.fit, self.units
         profile, found = fit.profile, f"{self.delay:.4g} {units.time}"
         if profile is None:
@@ -161,12 +161,12 @@ class FitFigures:
             if profile.cutoff is None and whole and fit.noise is None:
                 axes.plot([self.delay], [fit.cost], "v", color="black", ms=7, label=plain(f"minimum at {found}"))
             else:
-                # The cost of the estimate is that of all frequencies and samples, or of the innovations.
+                # The cost of the estimate uses all frequencies and samples, or the innovations.
                 what = "minimum at" if fit.noise is None else "estimate with the noise model:"
                 axes.axvline(self.delay, color="black", linewidth=0.8, label=plain(f"{what} {found}"))
         low, high = axes.get_ylim()
         if profile is not None and 0.0 < STEEP * profile.costs.min() < profile.costs[np.isfinite(profile.costs)].max():
-            # The least cost would lie on the axis of a straight scale, whatever the others around it are.
+            # On a linear scale the least cost would always lie on the axis.
             axes.set_yscale("log")
             low, high = axes.get_ylim()
             axes.set_ylim(low, high * (high / low) ** 0.35)
@@ -176,7 +176,7 @@ class FitFigures:
 
 
 def draw_overlay(axes: Any, measurement: Measurement, use: BoolArray, residuals: Array, units: Units) -> None:
-    """The measured output, and the simulated one at its used samples."""
+    """Draw the measured output, and the simulated one at its used samples."""
     record = measurement.record
     axes.plot(*outline(record.t, record.y), color=LIGHT, linewidth=2.2, zorder=1.9, label="measured")
     axes.plot(*curve(record.t, use, record.y[use] - residuals), color=DARK, linewidth=0.9, label="simulated")
@@ -187,14 +187,14 @@ def draw_overlay(axes: Any, measurement: Measurement, use: BoolArray, residuals:
 
 
 def curve(t: Array, use: BoolArray | IndexArray, values: Array) -> tuple[Array, Array]:
-    """The curve of values at the used instants, with breaks in the line where samples are missing."""
+    """Return the curve of values at the used instants, interrupted at missing samples."""
     full = np.full(t.size, np.nan)
     full[use] = values
     return outline(t, full)
 
 
 def _draw_lags(axes: Any, curves: Sequence[tuple[IntArray, Array]], labels: Sequence[str]) -> None:
-    """The correlations of the first experiments, or inputs."""
+    """Draw the correlations of the first experiments, or inputs."""
     axes.set_xlabel("lag [samples]")
     if not curves:
         axes.text(0.5, 0.5, "too few residuals", ha="center", va="center", transform=axes.transAxes)
@@ -203,7 +203,7 @@ def _draw_lags(axes: Any, curves: Sequence[tuple[IntArray, Array]], labels: Sequ
 
 
 def _draw_band(axes: Any, band: float, level: float, what: str) -> None:
-    """The band that correlations of the first experiment stay in, and the legend above it."""
+    """Draw the acceptance band of correlations of the first experiment, and the legend above it."""
     axes.axhspan(-band, band, color=BAND, zorder=0, label=f"{100 * level:.3g} % band if {what}")
     axes.axhline(0.0, color="black", linewidth=0.6)
     low, high = axes.get_ylim()

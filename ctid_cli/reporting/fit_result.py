@@ -1,4 +1,4 @@
-"""The result of ``ctid fit``: an estimated model with its uncertainty and diagnostics."""
+"""Result of ``ctid fit``: an estimated model with its uncertainty and diagnostics."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from ctid_cli.written_files import write_file
 FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"
 R2_DEFINITION = "1 - ||y - x||^2 / ||y - mean y||^2"
 
-#: The input between its samples.
+#: Hold of the input, in words.
 HOLDS: dict[Hold, str] = {
     "zoh": "constant between its samples",
     "foh": "straight lines between its samples",
@@ -63,33 +63,33 @@ TREATMENTS = {
 }
 #: Derived quantities that are greater than zero.
 POSITIVE = re.compile("time_constant|natural_frequency")
-#: Digits of the coefficients in the equation.
+#: Significant digits of the coefficients in the equation.
 DIGITS = 5
-#: Instants of outliers that the text names.
+#: Most instants of outliers in the text.
 MOST_NAMED = 5
-#: What a loss does to the samples that are listed, and its name.
+#: Effect of a loss on the listed samples, and its name.
 LITTLE = {"huber": "less than half their weight", "tukey": "no weight"}
 LOSSES = {"huber": "Huber's", "tukey": "Tukey's biweight"}
 
 
 @dataclass(frozen=True, eq=False)
 class FitResult(PagedResult):
-    """A fit with the records that it was made from."""
+    """A fit with its records."""
 
     fitted: Identification
     records: Records
-    #: How many samples ahead predictions are judged besides.
+    #: Additional horizons at which predictions are assessed [samples].
     ahead: int | None = None
 
     @classmethod
     def of(cls, fitted: Identification) -> FitResult:
-        """Return the result of a fit that was made in Python, whose records are in memory."""
+        """Return the result of a fit from Python, whose records are in memory."""
         other = None if fitted.validation is None else Measurement.of(fitted.validation.record)
         return cls(fitted, Records([Measurement.of(record) for record in fitted.records], other))
 
     @property
     def fine(self) -> str:
-        """What is said where nothing is to be warned of."""
+        """Sentence if there are no warnings."""
         fit = self.fitted.fit
         if isinstance(fit, MultiInputFit) or fit.noise is not None:
             return "The search ended well, and the residuals pass their tests; changes of the model were not tried."
@@ -102,7 +102,7 @@ class FitResult(PagedResult):
 
     @property
     def figures(self) -> FitFigures:
-        """The figure of the fit and its parts."""
+        """Figure of the fit and its parts."""
         return FitFigures(self.fitted, self.records.measurements, self.units)
 
     def sections(self) -> list[Section]:
@@ -125,7 +125,7 @@ class FitResult(PagedResult):
         return inputs_drawing(self.figures) if several else self.figures.all()
 
     def page_head(self) -> tuple[str, str]:
-        """Return the title of the page, and how well the model simulates."""
+        """Return the title of the page, and the quality of the simulation."""
         fit, validation = self.fitted.fit, self.fitted.validation
         structure = "; ".join(f"{name} {spelled(own)}".strip() for name, own in self._structures()) + self.lost_poles
         lead = f"{structure}: simulates {number(fit.fit_percent, 4)} % of "
@@ -155,7 +155,7 @@ class FitResult(PagedResult):
         yield Chapter("Model", [Section(sentences=equations), self.parameters(), self.derived(), quality])
 
     def cited(self) -> list[str]:
-        """Return the articles whose methods the fit used, and the frequency response that stands beside it."""
+        """Return the articles on the methods of the fit, and on the frequency response shown with it."""
         fitted = self.fitted
         keys = ["gonzalez2025" if fitted.options.kind == "additive_srivc" else "kaufman1975"]
         keys += ["huber2009"] if fitted.fit.weighting is not None else []
@@ -166,7 +166,7 @@ class FitResult(PagedResult):
     # --- sections ----------------------------------------------------------------------------------
 
     def data(self) -> Section:
-        """Return the records, and what reading them has shown."""
+        """Return the records, and notes from reading them."""
         lines: list[str] = []
         for measurement, use in zip(self.records.measurements, self.fitted.fit.used, strict=True):
             lines += [_record_line(measurement, int(np.count_nonzero(use)), self.units), *measurement.notes]
@@ -187,7 +187,7 @@ class FitResult(PagedResult):
         return Section.table(rows, DERIVED, notes=notes)
 
     def settings(self) -> Iterator[tuple[str, str]]:
-        """Return what was estimated, and how the records were taken."""
+        """Yield the estimator, and the treatment of the records."""
         fit, options, units, first = self.fitted.fit, self.fitted.options, self.units, self.records.measurements[0]
         yield from self.structure()
         yield from _loop(options, first)
@@ -209,7 +209,7 @@ class FitResult(PagedResult):
             yield "loss", _loss_text(fit, fit.weighting, self.records.data, units)
 
     def _structures(self) -> list[tuple[str, Options]]:
-        """Return what was asked of each of several inputs, by its name; of one input without a name."""
+        """Return the specified structure of each of several inputs by name; for one input without a name."""
         fit, options = self.fitted.fit, self.fitted.options
         if isinstance(fit, MultiInputFit) and isinstance(options, DelayProfile):
             names = list(fit.model.parts)
@@ -218,12 +218,12 @@ class FitResult(PagedResult):
 
     @property
     def lost_poles(self) -> str:
-        """How many of the poles that were asked for the model does not have."""
+        """Sentence on the poles that the model has fewer than specified."""
         lost = self.fitted.fit.poles_at_infinity
         return f" ({lost} of the poles at infinity, not shown)" if lost else ""
 
     def structure(self) -> Iterator[tuple[str, str]]:
-        """Return the structure of the model, and what of it was known."""
+        """Yield the structure of the model, and its known parameters."""
         options = self.fitted.options
         if isinstance(self.fitted.fit, MultiInputFit) and isinstance(options, DelayProfile):
             yield "model", "common denominator" if options.common else "a denominator for each input"
@@ -234,7 +234,7 @@ class FitResult(PagedResult):
             yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
 
     def quality(self) -> Iterator[tuple[str, str]]:
-        """Return what tells how good the fit is."""
+        """Yield measures of the quality of the fit."""
         fit, criteria, validation, units = self.fitted.fit, self.fitted.criteria, self.fitted.validation, self.units
         yield "fit", f"{number(fit.fit_percent, 5)} % = {FIT_DEFINITION}"
         yield "R2", f"{number(fit.r2, 6)} = {R2_DEFINITION}"
@@ -267,7 +267,7 @@ class FitResult(PagedResult):
             yield f"{fit.left_over}{number_of}", _tested(test)
 
     def search(self) -> Iterator[tuple[str, str]]:
-        """Return how the search went, and the bounds of the admissible models where it ended at them."""
+        """Yield the outcome of the search, and the bounds of the admissible models that it met."""
         fit, units = self.fitted.fit, self.units
         if fit.status is not Status.CONVERGED:
             yield "status", fit.status.value
@@ -284,11 +284,11 @@ class FitResult(PagedResult):
 
     @property
     def predicted(self) -> list[int]:
-        """How many samples ahead predictions are judged; nothing without a noise model."""
+        """Horizons of assessed predictions [samples]; empty without a noise model."""
         return [] if self.fitted.fit.noise is None else list(dict.fromkeys([1, self.ahead or 1]))
 
     def _noise(self, estimate: NoiseEstimate) -> Iterator[tuple[str, str]]:
-        """Return the noise model, how well it predicts, and the output-error fit beside it."""
+        """Yield the noise model, the quality of its predictions, and the output-error fit."""
         fit, units, (p, q) = self.fitted.fit, self.units, estimate.orders
         chosen = ", orders of least BIC" * estimate.chosen
         variance = units.amount(number(estimate.noise.innovation_variance or 0.0), units.square)
@@ -303,7 +303,7 @@ class FitResult(PagedResult):
         yield "output error", f"{text}. {test if estimate.test.freedom else 'Nothing is gained that a test could use'}"
 
     def file_text(self, folder: Path, command: str | None = None) -> str:
-        """Return the text of ``fit.json`` in a folder, from which the records are named."""
+        """Return the text of ``fit.json`` in a folder; paths of records are relative to it."""
         measurements, validation = self.records.measurements, self.records.validation
         return fit_text(self.fitted, self.content(), measurements, validation, folder, command)
 
@@ -313,7 +313,7 @@ class FitResult(PagedResult):
 
 
 def _unknown_ends(signal: HeldSignal, options: Options, units: Units) -> str:
-    """What is not known of a band-limited input for want of the samples beyond the ends."""
+    """Return how well a band-limited input is known without the samples beyond its ends."""
     if signal.hold != "band-limited" or options.initial_state == "periodic":
         return ""
     doubt = band_limited_doubt(signal.t, signal.values)
@@ -324,13 +324,13 @@ def _unknown_ends(signal: HeldSignal, options: Options, units: Units) -> str:
 
 
 def _searched(options: Options, units: Units) -> str:
-    """Range of the delay, or its known value."""
+    """Return the range of the delay, or its known value."""
     low, high = options.delay_bounds
     return f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
 
 
 def _loop(options: Options, measurement: Measurement) -> Iterator[tuple[str, str]]:
-    """The loop of a record, and what of it the estimate is made with."""
+    """Yield the loop of a record, and which part of it the estimator uses."""
     loop, instruments = measurement.record.loop, getattr(options, "instruments", "open_loop")
     if instruments == "reference":
         yield "loop", f"controller not known; what of the input follows r = {measurement.reference} as instrument"
@@ -341,7 +341,7 @@ def _loop(options: Options, measurement: Measurement) -> Iterator[tuple[str, str
 
 
 def _record_line(measurement: Measurement, used: int, units: Units) -> str:
-    """One record: its samples, those that are missing or not used, clock and columns."""
+    """Return one record: its samples, those that are missing or not used, clock and columns."""
     record = measurement.record
     missing = record.n_samples - int(np.count_nonzero(record.valid))
     less = [f"{used} used"] * (used < record.n_samples) + [f"{missing} missing"] * (missing > 0)
@@ -354,7 +354,7 @@ def _record_line(measurement: Measurement, used: int, units: Units) -> str:
 
 
 def _before(result: Identification, state: str) -> str:
-    """Return the input before the record, where it is not zero, and the options for it and for the state."""
+    """Return the input before the record, if it is not zero, and its options and those of the state."""
     before, state = getattr(result.options, "input_before", None), f"--initial-state {state}"
     if before is None:
         return f" ({state})"
@@ -377,7 +377,7 @@ def _offset(result: Identification, units: Units) -> str:
 
 
 def _covariance_line(result: Identification) -> str:
-    """What the standard errors hold for, and how coefficients are scaled and counted."""
+    """Return the assumptions of the standard errors, and how coefficients are scaled and numbered."""
     form = "Monic denominator, descending powers."
     if additive_of(result.fit) is not None:
         form = "g1_a2 multiplies p^2 in the denominator of the first submodel, whose constant term is 1."
@@ -385,7 +385,7 @@ def _covariance_line(result: Identification) -> str:
 
 
 def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record], units: Units) -> str:
-    """Return the scale of a loss other than squares, and the samples that count for little."""
+    """Return the scale of a loss other than squares, and the samples with a small weight."""
     kind, times = weighting.kind, weighting.outlier_times(records, fit.used)
     scales = ", ".join(number(loss.scale, 3) for loss in weighting.losses)
     deviation = units.amount(scales, units.output)
@@ -404,7 +404,7 @@ def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record]
 
 
 def _tested(test: ResidualTests) -> str:
-    """Return the outcome of the tests of residuals; the warnings say what to do."""
+    """Return the outcome of the tests of residuals; the warnings suggest remedies."""
     white = "white" if test.white else "not white"
     free = f"{'independent of' if test.uncorrelated else 'dependent on'} the {test.driver}"
     return f"{white} ({probability(test.whiteness_p_value)}), {free} ({probability(test.cross_p_value)})"
@@ -418,7 +418,7 @@ def save_fit(result: Identification, path: str | os.PathLike[str]) -> None:
     result : Identification
         The fit.
     path : path
-        The file, such as ``fit.json``. Since records in memory have no file, their samples are in it.
+        The file, such as ``fit.json``. It contains the samples of records in memory, which have no file.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Tables and code of a fitted model: its responses and residuals over time and frequency, and the model elsewhere."""
+"""Tables and code of a fitted model: responses and residuals over time and frequency, and export to other tools."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def fit_tables(result: FitResult) -> dict[str, pd.DataFrame]:
-    """Return what the page of a fit shows as tables by the names of their files; several records are numbered."""
+    """Return the tables of a fit's page by file name; several records are numbered."""
     fitted, units = result.fitted, result.units
     tables = {}
     for k, (name, model) in enumerate(models_of(fitted).items()):
@@ -79,7 +79,7 @@ def frequency_frame(band: FrequencyBand, units: Units) -> pd.DataFrame:
 
 
 def model_code(fit: FittedModel, tool: Tool, time_unit: str, pade: int | None = None) -> tuple[str, str]:
-    """Return the name of a file and the code in it that builds a model in another tool, with every digit."""
+    """Return a file name and the code that builds a model in another tool, with all digits."""
     if pade is not None and tool != "control":
         raise UsageError(f"--pade is for control, which knows no delays, not for {tool}, where the delay stays exact")
     models = models_of(fit) if isinstance(fit, Identification) else {"": fit}

@@ -1,4 +1,4 @@
-"""The result of ``ctid fit`` on a frequency response, and its figure."""
+"""Result of ``ctid fit`` on a frequency response, and its figure."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from ctid_cli.text import count, probability
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: What lines weigh by where they have no standard errors.
+#: Weights of lines without standard errors.
 WEIGHTS = {
     "inverse": "reciprocal of the gain, for relative errors",
     "inverse-sqrt": "reciprocal of the square root of the gain",
@@ -44,7 +44,7 @@ class FrequencyFitResult(FitResult):
 
     @property
     def fine(self) -> str:
-        """What is said where nothing is to be warned of."""
+        """Sentence if there are no warnings."""
         return "The search ended well, and the residuals agree with what is known of the data."
 
     @classmethod
@@ -54,7 +54,7 @@ class FrequencyFitResult(FitResult):
 
     @property
     def fit(self) -> FrequencyDomainFit:
-        """The estimate."""
+        """Estimate."""
         assert isinstance(self.fitted.fit, FrequencyDomainFit)
         return self.fitted.fit
 
@@ -65,14 +65,14 @@ class FrequencyFitResult(FitResult):
         return Units(time, input_, output)
 
     def data(self) -> Section:
-        """Return the data, and what reading them has shown."""
+        """Return the data, and notes from reading them."""
         data, time = self.fit.data, self.units.time
         low, high = data.frequencies[[0, -1]]
         name, lines = shown(data.name) or "frequency response", count(data.frequencies.size, "line")
         return Section(sentences=[f"{name}: {lines} from {low:.6g} to {high:.6g} rad/{time}", *data.notes])
 
     def settings(self) -> Iterator[tuple[str, str]]:
-        """Return what was estimated, and how the data were taken."""
+        """Yield the estimator, and the treatment of the data."""
         data, time = self.fit.data, self.units.time
         yield from self.structure()
         sampled = f"those of samples at intervals of {data.interval:g} {time}, input constant between them"
@@ -88,7 +88,7 @@ class FrequencyFitResult(FitResult):
         return Section.table(parameters_of(self.fitted, self.units), PARAMETER, notes=notes)
 
     def _errors(self) -> str:
-        """What the standard errors hold for."""
+        """Return the assumptions of the standard errors."""
         fit, law = self.fit, self.fitted.uncertainty
         if not self.fitted.answer.seen:
             return "There are no standard errors, as the values are not seen to be anything but noise."
@@ -104,7 +104,7 @@ class FrequencyFitResult(FitResult):
         return f"{text}; intervals are estimate -+ {law.quantile(np.zeros(1)):.3g} of them."
 
     def quality(self) -> Iterator[tuple[str, str]]:
-        """Return what tells how good the fit is."""
+        """Yield measures of the quality of the fit."""
         fit, criteria = self.fit, self.fitted.criteria
         yield "fit", f"{number(fit.fit_percent, 5)} % = {FIT_DEFINITION}"
         yield "", "G values, M model, W weights"
@@ -126,7 +126,7 @@ class FrequencyFitResult(FitResult):
         return frequency_fit_drawing(self.fit, self.units)
 
     def page_head(self) -> tuple[str, str]:
-        """Return the title of the page, and how well the model fits."""
+        """Return the title of the page, and the quality of the fit."""
         fit = self.fit
         lines = count(fit.data.frequencies.size, "weighted line")
         asked = f"{spelled(self.fitted.options)}{self.lost_poles}"
@@ -160,7 +160,7 @@ class FrequencyFitResult(FitResult):
 
 
 def frequency_fit_drawing(fit: FrequencyDomainFit, units: Units) -> Drawing:
-    """Gain and phase of values and model, and the residuals beside the standard errors."""
+    """Return a figure of gain and phase of values and model, and the residuals with the standard errors."""
     data, seen = fit.data, fit.data.frequencies > 0.0
     w, values, model = data.frequencies[seen], data.response[seen], fit.answers(data.frequencies)[seen]
     angle = np.unwrap(np.angle(model))

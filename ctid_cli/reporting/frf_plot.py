@@ -1,4 +1,4 @@
-"""The figure of a frequency response without a model, and the part of it that stands behind that of a model."""
+"""Figure of a frequency response without a model, and its part in the background of a model's response."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def frf_drawing(found: FrequencyResponse, units: Units, title: str) -> Drawing:
-    """Gain, phase and coherence over frequency."""
+    """Return a figure of gain, phase and coherence over frequency."""
 
     def draw(figure: Figure) -> None:
         gain, phase, coherence = figure.subplots(3, 1, sharex=True, height_ratios=[2.2, 1.5, 0.9])
@@ -35,7 +35,7 @@ def frf_drawing(found: FrequencyResponse, units: Units, title: str) -> Drawing:
         coherence.set_ylim(-0.05, 1.05)
         name_axes(coherence, y="coherence [-]")
         gain.margins(x=0.02)
-        # The bound falls for ever towards low frequencies.
+        # The bound decreases without limit towards low frequencies.
         lowest = np.nanmin(decibels(np.minimum(np.abs(found.response), np.maximum(found.standard_error, 1e-12))))
         gain.set_ylim(bottom=max(gain.get_ylim()[0], float(lowest) - 12.0))
         name_response(gain, phase, coherence, units)
@@ -45,7 +45,7 @@ def frf_drawing(found: FrequencyResponse, units: Units, title: str) -> Drawing:
 
 
 def name_response(gain: Any, phase: Any, lowest: Any, units: Units) -> None:
-    """The axes of a frequency response, and the legend."""
+    """Label the axes of a frequency response, and draw the legend."""
     name_axes(gain, y=f"gain [{units.amount('dB re 1', units.gain)}]", legend="lower left")
     name_axes(phase, y="phase [°]")
     name_axes(lowest, f"frequency ω [rad/{units.time}]")
@@ -54,11 +54,10 @@ def name_response(gain: Any, phase: Any, lowest: Any, units: Units) -> None:
 def draw_points(
     gain: Any, phase: Any, found: FrequencyResponse, label: str = "without a model", around: Array | None = None
 ) -> None:
-    """Points of gain [dB] and phase [degrees] with their pointwise 95 % intervals in grey, on logarithmic frequency.
+    """Draw gain [dB] and phase [degrees] with pointwise 95 % intervals in grey, over logarithmic frequency.
 
-    A lower end of zero goes down to the standard error; a point without an interval stands alone, and one whose phase
-    is not known has none. Of all angles that a phase may be, those next to the phases ``around`` [rad] are drawn, if
-    they are given.
+    A lower end of zero is drawn at a tenth of the standard error; a point without an interval has no bar, and one of
+    unknown phase is left out. Phases are unwrapped to be nearest to ``around`` [rad], if given.
     """
     low, high = found.gain_band()
     size = np.abs(found.response)
@@ -78,6 +77,6 @@ def draw_points(
 
 
 def decibels(values: Any) -> Any:
-    """Sizes in decibels; NaN where there is none."""
+    """Return magnitudes in decibels; NaN if there is none."""
     with np.errstate(divide="ignore"):
         return np.where(values > 0, 20 * np.log10(np.maximum(values, 1e-300)), np.nan)

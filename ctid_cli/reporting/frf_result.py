@@ -1,4 +1,4 @@
-"""The result of ``ctid frf``: a frequency response without a model."""
+"""Result of ``ctid frf``: a frequency response without a model."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PRINTED = (
     *("frequency", "gain", "gain_low", "gain_high", "phase", "phase_half_width"),
     *("coherence", "distortion"),
 )
-#: How each method is called in text.
+#: Name of each method in text.
 METHODS = {
     "periodic": "mean over periods",
     "local-polynomial": "local polynomials",
@@ -34,7 +34,7 @@ METHODS = {
 
 @dataclass(frozen=True, eq=False)
 class FrequencyResponseResult(Result):
-    """A frequency response with the records that it was estimated from."""
+    """A frequency response with the records from which it was estimated."""
 
     schema = "ctid-frf-1"
 
@@ -58,7 +58,7 @@ class FrequencyResponseResult(Result):
         return frf_drawing(self.found, self.records.units, self.records.names)
 
     def _values(self) -> dict[str, Array]:
-        """Return what is known at each frequency, by the keys of the quantities; intervals hold with 95 %."""
+        """Return the values at each frequency, by the keys of the quantities, with 95 % intervals."""
         found = self.found
         low, high = found.gain_band()
         values = {
@@ -77,9 +77,9 @@ class FrequencyResponseResult(Result):
         return values if found.distortion is None else values | {"distortion": np.sqrt(found.distortion)}
 
     def to_frame(self) -> pd.DataFrame:
-        """Return all frequencies; intervals hold with 95 %."""
+        """Return all frequencies, with 95 % intervals."""
         names, found = {column.key: column.name for column in quantities(self.records.units)}, self.found
-        # What a fit to the table needs to know of its values.
+        # Attributes that a fit to the table uses.
         told = {
             "freedom": found.freedom,
             "hold_interval": np.full(found.frequencies.size, found.interval or np.nan),
@@ -96,7 +96,7 @@ class FrequencyResponseResult(Result):
 
 
 def quantities(units: Units) -> tuple[Column, ...]:
-    """Return what is told of a response at each frequency."""
+    """Return the quantities of a response at each frequency."""
     gain = units.gain if units.is_known(units.gain) else ""
     return (
         Column("frequency", "", ".4g", f"rad/{units.time}"),

@@ -1,4 +1,4 @@
-"""How numbers and tables are written as text."""
+"""Formatting of numbers and tables as text."""
 
 import math
 import re
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-from ctid_cli.text import count as count  # for those who draw
+from ctid_cli.text import count as count  # re-exported for figures
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], sides: str) -> str:
@@ -15,7 +15,7 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], sides: 
     return "\n".join([first, "|" + "|".join(":--" if side == "l" else "--:" for side in sides) + "|", *body])
 
 
-#: What LaTeX would read as something else.
+#: Special characters of LaTeX.
 _LATEX = str.maketrans(
     {
         **{sign: f"\\{sign}" for sign in "&%$#_{}"},
@@ -28,11 +28,11 @@ _LATEX = str.maketrans(
 
 
 def latex(text: str) -> str:
-    """A text for LaTeX."""
+    """Escape a text for LaTeX."""
     return text.translate(_LATEX)
 
 
-#: A cell with more letters than these may be broken into lines.
+#: A cell with more characters may be broken into lines.
 WORDS = 32
 
 
@@ -43,7 +43,7 @@ def marked(text: str) -> str:
 
 
 def html_paragraphs(sentences: Sequence[str], style: str = "") -> str:
-    """Return paragraphs; a text with line ends is drawn already, one that begins with a hyphen is an item of a list."""
+    """Return paragraphs; a text with line ends is preformatted, one that begins with a hyphen is a list item."""
     shown = []
     for text in sentences:
         if "\n" in text:
@@ -56,7 +56,7 @@ def html_paragraphs(sentences: Sequence[str], style: str = "") -> str:
 
 
 def html_table(lines: Sequence[Sequence[str]], sides: str) -> str:
-    """Return header and rows as a table, each column left (l) or right (r); without titles it is a list of pairs."""
+    """Return header and rows as a table, each column left (l) or right (r); without header it is a list of pairs."""
     header, *rows = lines
     titled = any(header)
     sides = sides if titled else "l" * len(header)
@@ -74,12 +74,12 @@ def html_table(lines: Sequence[Sequence[str]], sides: str) -> str:
 
 
 def picked(item: object, names: Iterable[str]) -> dict[str, Any]:
-    """Some attributes of an object, or values of a mapping, as data; None where a mapping lacks one."""
+    """Return some attributes of an object, or values of a mapping, as data; None if a mapping lacks one."""
     return {name: item.get(name) if isinstance(item, Mapping) else getattr(item, name) for name in names}
 
 
 def number(value: object, digits: int = 6) -> str:
-    """A number for people; a dash where there is none."""
+    """Format a number; a dash if there is none."""
     if value is None:
         return "-"
     if isinstance(value, float):
@@ -88,7 +88,7 @@ def number(value: object, digits: int = 6) -> str:
 
 
 def with_error(value: float, error: float) -> str:
-    """A value and its standard error, both to the second digit of the error."""
+    """Format a value and its standard error, both to the second digit of the error."""
     if not (math.isfinite(value) and math.isfinite(error) and error > 0):
         return f"{number(value)} ± {number(error, 2)}"
     digits = 2
@@ -98,29 +98,29 @@ def with_error(value: float, error: float) -> str:
 
 
 def _to_digits(value: float, digits: int) -> str:
-    """A number with its trailing zeros: 0.0400, 2.0, 26, 130."""
+    """Format a number with its trailing zeros: 0.0400, 2.0, 26, 130."""
     return written_out(f"{value:#.{digits}g}".removesuffix("."))
 
 
 def written_out(text: str) -> str:
-    """A number below a million without an exponent: 1300, not 1.3e+03."""
+    """Format a number below a million without an exponent: 1300, not 1.3e+03."""
     return f"{float(text):.0f}" if "e+" in text and abs(float(text)) < 1e6 else text
 
 
 def rate(speed: float) -> str:
-    """How many there are in a second, or in a minute where these are few."""
+    """Format a rate per second, or per minute if it is low."""
     return f"{speed:.2g}/s" if speed >= 0.1 else f"{60 * speed:.2g}/min"
 
 
 def percent(value: float | None, n: int) -> str:
-    """A percentage out of ``n``; one decimal where ``n`` can resolve it."""
+    """Format a percentage out of ``n``, with one decimal if ``n`` can resolve it."""
     if value is None or not math.isfinite(value):
         return "-"
     return f"{value:.1f}" if n > 100 else f"{value:.0f}"
 
 
 def seconds(value: float | None) -> str:
-    """A duration in a unit that fits."""
+    """Format a duration in a suitable unit."""
     if value is None or not math.isfinite(value):
         return "-"
     if value < 0.9995:
@@ -138,12 +138,12 @@ def setting_title(key: str) -> str:
 
 
 def setting_text(key: str, value: Any) -> str:
-    """Return the value of a swept field, with its unit where the title does not say it."""
+    """Return the value of a swept field, with its unit if the title has none."""
     return f"{number(value)} dB" if key == "snr_db" and value is not None else number(value)
 
 
 def delay_label(initial_delay: float | str | None) -> str:
-    """An initial delay as a column title."""
+    """Return an initial delay as a column title."""
     if initial_delay is None:
         return "none"
     return initial_delay if isinstance(initial_delay, str) else f"{initial_delay:g} s"

@@ -2,18 +2,18 @@
 
 Keys of a row
 -------------
-- ``table``, ``experiment``, ``sampling``; one key per swept field; ``initial_delay``: where the search started [s],
-  ``"random"``, or None for an estimator that needs no start; ``method``: name of the estimator.
+- ``table``, ``experiment``, ``sampling``; one key per swept field; ``initial_delay``: start of the search [s],
+  ``"random"``, or None for an estimator without a start; ``method``: name of the estimator.
 - ``n``: data sets; ``failed``: those without a result.
-- Of percentages: ``converged``; ``percent`` with its 95 % Wilson interval ``low`` and ``high`` [%];
+- For percentages: ``converged``; ``percent`` with its 95 % Wilson interval ``low`` and ``high`` [%];
   ``published_percent`` [%]; ``median_seconds`` and ``median_cpu_seconds``: median wall and processor time of one
-  estimate [s]. Of frequencies of a signal: ``median_settling_time`` and ``median_settling_after_step`` of the slowest
-  tone [s], missing where half of the data sets or more never settled; ``median_rms_1 …`` [rad/s]; ``false_alarms`` of
+  estimate [s]. For frequencies of a signal: ``median_settling_time`` and ``median_settling_after_step`` of the slowest
+  tone [s], missing if half of the data sets or more never settled; ``median_rms_1 …`` [rad/s]; ``false_alarms`` of
   all data sets.
-- Of measures: ``measure``, as it was asked for; ``parameter``: what it is about, None for the estimate as a whole, the
-  status where failures are counted; ``unit``; ``value`` with its Monte Carlo standard error ``error`` and 95 % interval
-  from ``low`` to ``high``; None where the data sets do not tell; ``without_value``: data sets without what is measured,
-  with those that failed. Distances and fits count them as infinitely bad, other measures leave them out
+- For measures: ``measure``, its name; ``parameter``, None for the estimate as a whole, the
+  status if failures are counted; ``unit``; ``value`` with its Monte Carlo standard error ``error`` and 95 % interval
+  from ``low`` to ``high``; None if it cannot be estimated; ``without_value``: data sets without a value,
+  including those that failed. Distances and fits count them as infinitely bad, other measures leave them out
   (``counted_in``).
 """
 
@@ -50,13 +50,13 @@ Row = dict[str, Any]
 
 #: Settings that are keys of every row, and their key path in a specification.
 ALWAYS = {"snr_db": "noise.snr_db"}
-#: Statuses of estimates with which nothing is wrong.
+#: Statuses of successful estimates.
 SUCCESSES = {Status.CONVERGED.name, Status.LEAST_SQUARES.name, "VALID"}
-#: What is measured where the specification does not say.
+#: Default measures.
 DEFAULT = ("bias", "rmse")
-#: Measures of which an estimate without a value counts as infinitely bad.
+#: Measures for which an estimate without a value counts as infinitely bad.
 INFINITE = [name for name, item in MEASURES.items() if item.source in ("distance", "fresh_fit_percent")]
-#: What the measures of frequencies begin with in rows.
+#: Prefixes of the measures of frequencies in rows.
 OF_FREQUENCIES = ("median_settling", "median_rms", "false_alarms")
 
 
@@ -71,7 +71,7 @@ def parts_of(frame: pd.DataFrame, *keys: Any) -> Iterator[tuple[Any, pd.DataFram
     yield from frame.groupby([*keys], sort=False, dropna=False)
 
 
-# --- which groups there are -----------------------------------------------------------------------------------------
+# --- planned groups -------------------------------------------------------------------------------------------------
 
 
 def label_frame(
@@ -84,7 +84,7 @@ def label_frame(
     down, across = results.swept("data_cells"), results.swept("estimators")
     fields = fields or ({} if is_of_signal(manifest) else ALWAYS)
     constant = {name: lookup(results.settings, path) for name, path in fields.items()}
-    # Several sets of initial parameters are told apart by their names, as initial delays are by their values.
+    # Several sets of initial parameters are identified by their names, initial delays by their values.
     given = {label for label, delay in manifest["starts"].items() if delay is None and label != "none"}
     rows = []
     for cell, estimator, start in results.groups.itertuples(index=False, name=None):
@@ -101,7 +101,7 @@ def label_frame(
 
 
 def settings_of(names: Iterable[Any]) -> list[str]:
-    """Return the keys of swept fields; none has a reserved name, but initial parameters are told apart by theirs."""
+    """Return the keys of swept fields: all names but reserved ones; ``start`` is that of initial parameters."""
     others = reserved_names().difference(["start"])
     return [name for name in names if name not in others and not name.startswith(OF_FREQUENCIES)]
 
@@ -132,9 +132,9 @@ def _measure_frame(results: Results, measures: Mapping[str, Measure], labels: pd
 def percentage_frame(
     results: Results, table: int | str | None = None, fields: Mapping[str, str] | None = None
 ) -> pd.DataFrame:
-    """Return how often the estimators of an experiment converged, and other measures of whole estimates, side by side.
+    """Return the percentages of convergence, and other measures of whole estimates, side by side.
 
-    There is a row for each group that was planned.
+    There is a row for each planned group.
     """
     measures = {"percent": MEASURES["percent"], **_medians(results)}
     long = _measure_frame(results, measures, label_frame(results, table, fields))
@@ -146,7 +146,7 @@ def percentage_frame(
 
 
 def _medians(results: Results) -> dict[str, Measure]:
-    """Return what else tables show of whole estimates: times, and the measures of frequencies that are stored."""
+    """Return the other measures of whole estimates in tables: times, and stored measures of frequencies."""
     clocks = {name: Measure("median time of one estimate", "s", name, quantile) for name in CLOCKS}
     measured = list(map(str, results.tracks))
     bases = {base_name(name)[0] for name in measured}
@@ -169,7 +169,7 @@ def with_types(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _measured(results: Results, name: str, measure: Measure) -> pd.DataFrame:
-    """Return one measure of every planned group, a row for each parameter or status that it is about."""
+    """Return one measure of every planned group, a row for each parameter or status."""
     import pandas as pd
 
     values = values_of(results, name, measure)
@@ -197,7 +197,7 @@ def _measured(results: Results, name: str, measure: Measure) -> pd.DataFrame:
 
 
 def measured_of(columns: Mapping[str, Array], measure: Measure, bound: float = math.nan) -> Measured:
-    """Return a measure of the values of one group, of those that are known."""
+    """Return a measure of the known values of one group."""
     known = ~np.isnan(columns["value"])
     own = {key: column[known] for key, column in columns.items()}
     if measure.source == "errors":
@@ -206,16 +206,16 @@ def measured_of(columns: Mapping[str, Array], measure: Measure, bound: float = m
 
 
 def _bounds(results: Results) -> dict[int, dict[str, float]]:
-    """Return the variances that theory gives the parameters of each group, where it does."""
+    """Return the variances of the parameters of each group by theory, if they are known."""
     if results.plan is None:
         return {}
     return {k: least_variances(results.plan, *place) for k, *place in results.groups.iloc[:, :2].itertuples()}
 
 
 def values_of(results: Results, name: str, measure: Measure) -> pd.DataFrame:
-    """Return the estimates as a measure sees them: ``group``, ``parameter``, ``replicate`` and ``value``.
+    """Return the values of the estimates in a measure: ``group``, ``parameter``, ``replicate`` and ``value``.
 
-    Of errors, also ``standard_error`` and ``quantile``. NaN marks an estimate without a value.
+    For errors, also ``standard_error`` and ``quantile``. NaN marks an estimate without a value.
     """
     import pandas as pd
 
@@ -234,11 +234,11 @@ def values_of(results: Results, name: str, measure: Measure) -> pd.DataFrame:
                 system = system_of(results.manifest["data_cells"][results.place(group)[0]], name)
                 values[numbers == group] = distances(system, results.members(group), name)
         case "converged":
-            # Of a group with an estimate that no rule is about, nothing is said.
+            # A group with an estimate to which no rule applies is left out.
             judged = pd.Series(stored.judged)
             values = judged.mask(judged.isna().groupby(numbers).transform("any")).to_numpy()
         case "measures":
-            # Of several tones the last one to settle counts; a track that never does so, later than all others.
+            # With several tones the last one to settle counts; one that never settles is later than all others.
             measured = map(str, results.tracks)
             tones = [tone for tone in measured if name.removeprefix("median_") in (tone, base_name(tone)[0])]
             values = results.tracks[tones].fillna(math.inf).max(axis=1).to_numpy()
@@ -248,7 +248,7 @@ def values_of(results: Results, name: str, measure: Measure) -> pd.DataFrame:
         case source:
             values = stored.column(source) if stored.has(source) else values
             if source == "fresh_fit_percent" and stored.has(source):
-                # Where there is no model, it fits a fresh data set infinitely badly.
+                # Without a model, the fit to a fresh data set is infinitely bad.
                 values = np.where(np.isfinite(values), values, -np.inf)
     return estimates.assign(value=values)
 
@@ -270,13 +270,13 @@ def _errors_for(results: Results, name: str, measure: Measure) -> pd.DataFrame:
 
 
 def counted_in(rows: pd.DataFrame) -> pd.Series:
-    """Return the number of data sets that each value is computed from."""
+    """Return the number of data sets from which each value is computed."""
     infinite = rows["measure"].str.partition(":")[0].isin(INFINITE)
     return rows["n"] - rows["without_value"].where(~infinite, 0)
 
 
 def measure_of(name: str, results: Results) -> Measure:
-    """Return the measure that a name asks for: one of ctid's, or a custom one of the specification."""
+    """Return the measure with a name: one of ctid's, or a custom one of the specification."""
     contents = results.manifest["data_cells"][0]["content"].get("custom_measures") or {}
     custom = {
         own: Measure(f"median of {content['kind']}", content["unit"], "custom_measures", quantile)
@@ -286,19 +286,19 @@ def measure_of(name: str, results: Results) -> Measure:
 
 
 def asked_measures(results: Results) -> list[str]:
-    """Return the names of the measures that the specification asks for."""
+    """Return the names of the measures in the specification."""
     return [one if isinstance(one, str) else one["name"] for one in results.settings.get("measures") or ()]
 
 
 def default_measures(results: Results) -> Sequence[str]:
-    """Return what the specification asks for; without a success rule bias and root mean square error; else nothing."""
+    """Return the measures of the specification; without a success rule bias and RMSE; else nothing."""
     asked = asked_measures(results)
     measurable = not results.settings.get("success") and results.is_simulated
     return asked or (DEFAULT if measurable else ())
 
 
 def _require_measurable(name: str, results: Results) -> None:
-    """Refuse a measure of what these results do not have."""
+    """Refuse a measure that these results do not have."""
     measure, argument, where = measure_of(name, results), name.partition(":")[2], results.experiment
     true = [name for cell in results.manifest["data_cells"] for name in true_values(cell)]
     if measure.source == "errors" and not true:
@@ -317,7 +317,7 @@ def _require_measurable(name: str, results: Results) -> None:
 
 
 def parameter_unit(name: str, names: Sequence[str]) -> str:
-    """Return the unit of one of the parameters of a system; ``-`` of those that are not known here."""
+    """Return the unit of a parameter of a system; ``-`` if it is not known here."""
     if name.startswith("pole_"):
         return "rad/s"
     if is_delay(name):

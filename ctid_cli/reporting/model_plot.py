@@ -1,4 +1,4 @@
-"""Figures of a fitted model: what it does on another record, over frequency and time, and how well it is known."""
+"""Figures of a fitted model: validation, responses over frequency and time, poles, and the delay."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from ctid_cli.signals.measurement import Measurement
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Points of an ellipse.
+#: Number of points of an ellipse.
 AROUND = np.linspace(0.0, 2 * np.pi, 121)
-#: Frequencies at which a model is drawn.
+#: Number of frequencies at which a model is drawn.
 POINTS = 500
-#: The line of a model.
+#: Line style of a model.
 LINE: dict[str, Any] = {"color": DARK, "linewidth": 1.2}
-#: Bands of the gain [dB] are cut at this distance from it; a wider band of the phase [degrees] says nothing.
+#: Bands of the gain [dB] are cut at this distance from it; a wider band of the phase [degrees] is not informative.
 WIDEST_GAIN, WIDEST_PHASE = 40.0, 180.0
 
 
 def validation_drawing(outcome: Validation, measurement: Measurement, units: Units) -> Drawing:
-    """Measured and simulated output of the record that the model was validated on."""
+    """Return the figure of measured and simulated output of the validation record."""
 
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
@@ -47,7 +47,7 @@ def validation_drawing(outcome: Validation, measurement: Measurement, units: Uni
 
 
 def bode_drawing(band: FrequencyBand, found: FrequencyResponse | None, units: Units) -> Drawing:
-    """Gain [dB] and phase [degrees] of a model with their bands, over what the record says without a model."""
+    """Return the figure of gain [dB] and phase [degrees] of a model, over the response estimated without a model."""
 
     def draw(figure: Figure) -> None:
         gain, phase = figure.subplots(2, 1, sharex=True, height_ratios=[1.4, 1.0])
@@ -60,7 +60,7 @@ def bode_drawing(band: FrequencyBand, found: FrequencyResponse | None, units: Un
 
 
 def draw_bode(gain: Any, phase: Any, band: FrequencyBand, units: Units) -> None:
-    """Gain [dB] and phase [degrees] of a model with their bands."""
+    """Draw gain [dB] and phase [degrees] of a model with their bands."""
     w, size, angle = band.frequencies, decibels(band.gain), np.rad2deg(band.phase)
     low = np.maximum(decibels(band.gain_lower), size - WIDEST_GAIN)
     gain.fill_between(w, low, np.minimum(decibels(band.gain_upper), size + WIDEST_GAIN), **_shade(band.level))
@@ -72,12 +72,12 @@ def draw_bode(gain: Any, phase: Any, band: FrequencyBand, units: Units) -> None:
 
 
 def step_drawing(band: ResponseBand, units: Units) -> Drawing:
-    """Response to a step of size one, with its band."""
+    """Return the figure of the unit step response, with its band."""
     return Drawing(8.0, 2.8, lambda figure: draw_step(figure.add_subplot(), band, units))
 
 
 def draw_step(axes: Any, band: ResponseBand, units: Units) -> None:
-    """Response to a step of size one, with its band."""
+    """Draw the unit step response, with its band."""
     axes.fill_between(band.t, band.lower, band.upper, **_shade(band.level))
     axes.plot(band.t, band.value, label="model", **LINE)
     axes.margins(x=0.0)
@@ -85,12 +85,12 @@ def draw_step(axes: Any, band: ResponseBand, units: Units) -> None:
 
 
 def _shade(level: float) -> dict[str, Any]:
-    """Look of the band of a model."""
+    """Return the style of the band of a model."""
     return {"color": DARK, "alpha": 0.25, "linewidth": 0.0, "label": f"{100 * level:.3g} % band of the model"}
 
 
 def inputs_drawing(figures: FitFigures) -> Drawing:
-    """Output, residuals and their correlation of a fit with several inputs, then a row for each input."""
+    """Return output, residuals and their correlation of a fit with several inputs, and a row for each input."""
     models, n = models_of(figures.result), figures.drawn
 
     def draw(figure: Figure) -> None:
@@ -111,7 +111,7 @@ def inputs_drawing(figures: FitFigures) -> Drawing:
 
 
 def poles_drawing(band: PoleBand, zeros: ComplexArray, units: Units) -> Drawing:
-    """Poles with the regions that hold them, and zeros, in the complex plane."""
+    """Return the figure of poles with confidence regions, and zeros, in the complex plane."""
 
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
@@ -131,7 +131,7 @@ def poles_drawing(band: PoleBand, zeros: ComplexArray, units: Units) -> Drawing:
 
 
 def draw_poles(axes: Any, band: PoleBand) -> None:
-    """Poles, with an ellipse each, of a real pole an interval."""
+    """Draw poles with an ellipse each, real poles with an interval."""
     words: str | None = f"{100 * band.level:.3g} % region"
     for pole, covariance, low, high, reach in zip(
         band.value, band.covariance, band.lower, band.upper, band.reach, strict=True
@@ -150,7 +150,7 @@ def draw_poles(axes: Any, band: PoleBand) -> None:
 
 
 def delay_drawing(figures: FitFigures, near: DelayCosts | None) -> Drawing:
-    """The search over the delay, and beside it the cost so close to the estimate that its minimum is seen."""
+    """Return the search over the delay, and the cost close to the estimate, which shows its minimum."""
     delay, time = figures.delay, figures.units.time
 
     def draw(figure: Figure) -> None:

@@ -1,4 +1,4 @@
-"""The result of ``ctid order``: the structures that a model is chosen from."""
+"""Result of ``ctid order``: the structures from which a model is chosen."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from ctid_cli.text import count
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Rows of the printed table.
+#: Most rows of the printed table.
 ROWS = 12
-#: Mark of a structure that cannot be chosen, whatever its criterion, and what it means.
+#: Mark of a structure that cannot be chosen, and its meaning.
 NO_CANDIDATE = "no"
 ABOUT_NO_CANDIDATE = (
     "- Not to be chosen (no): the data do not determine the parameters; or a pair is held at the least damping or the "
@@ -34,13 +34,13 @@ ABOUT_NO_CANDIDATE = (
     "of the record that it did not see far better."
 )
 STRUCTURE = ("poles", "zeros", "integrators")
-#: The same of a sum of second-order submodels.
+#: Columns that identify a sum of second-order submodels.
 OF_A_SUM = ("modes", "integrators")
 
 
 @dataclass(frozen=True, eq=False)
 class OrderSearchResult(Result):
-    """The structures of a choice with the records that they were fitted to."""
+    """Structures of a choice with the records to which they were fitted."""
 
     schema = "ctid-order-1"
 
@@ -50,11 +50,11 @@ class OrderSearchResult(Result):
 
     @classmethod
     def of(cls, choice: Choice, given: Given, records: Records) -> OrderSearchResult:
-        """Judge the structures of a choice."""
+        """Return the structures of a choice with their diagnostics."""
         return cls(choice, judged_candidates(choice, given, records.validation_record), records)
 
     def sections(self) -> list[Section]:
-        """Return the choice, the best structures, and what else was chosen."""
+        """Return the choice, the best structures, and the other choices."""
         choice = self.choice
         verdict = f"Chosen: {spelled(choice.ranking.best.options)}." if choice.seen else choice.why_none
         notes = [f"- {note}" for note in (*choice.sentences, *self.records.notes)]
@@ -69,18 +69,18 @@ class OrderSearchResult(Result):
         ]
 
     def drawing(self) -> Drawing:
-        """Return the figure of what each structure gains."""
+        """Return the figure of error and criterion of each structure."""
         return Drawing(7.5, 3.7, self._draw)
 
     def _draw(self, figure: Figure) -> None:
-        """Draw error and criterion over all poles, a line for each number of zeros; with an integrator open marks."""
+        """Draw error and criterion over all poles, a line for each number of zeros; open marks with an integrator."""
         error, criterion = figure.subplots(1, 2)
         best = self.choice.ranking.best
         is_sum = isinstance(best.options, AdditiveOutputError)
         by_size = sorted(self.choice.ranking.candidates, key=lambda each: each.options.order)
         lines: dict[tuple[int, int], list[Candidate]] = {}
         for each in by_size:
-            # All sums are one line.
+            # All sums share one line.
             lines.setdefault((0 if is_sum else each.options.zeros, each.options.integrators), []).append(each)
         for (zeros, integrators), own in sorted(lines.items()):
             poles = [each.options.order for each in own]
@@ -94,7 +94,7 @@ class OrderSearchResult(Result):
             chosen = {"color": MARK, "markersize": 13, "fillstyle": "none", "label": "chosen"}
             criterion.plot(best.options.order, 0.0, "o", **chosen)
         error.set_yscale("log")
-        # Linear where structures differ by little, logarithmic beyond.
+        # Linear for small differences, logarithmic beyond.
         criterion.set_yscale("symlog", linthresh=10.0)
         for axes, name in ((error, "root mean square output error"), (criterion, "criterion above the least")):
             name_axes(axes, "poles, integrators included", name)
@@ -166,7 +166,7 @@ class OrderSearchResult(Result):
 
 
 def _structure(options: Searched) -> dict[str, Any]:
-    """Return the numbers that tell a structure from others, and the terms of a sum."""
+    """Return the numbers that identify a structure, and the terms of a sum."""
     if isinstance(options, AdditiveOutputError):
         terms = [asdict(term) for term in options.terms]
         return {"modes": len(terms), "integrators": options.integrators, "terms": terms}

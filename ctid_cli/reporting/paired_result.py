@@ -1,13 +1,13 @@
-"""Two estimators on the same data sets: the result of ``ctid table EXPERIMENT --compare A,B``.
+"""Two estimators on the same data sets: result of ``ctid table EXPERIMENT --compare A,B``.
 
 Columns
 -------
 - The keys of all tables; ``first`` and ``second`` in place of ``method``: the estimators with their swept options.
 - ``measure``: ``percent``, ``rmse`` or ``cpu``, with the ``parameter`` and the ``unit``; ``value``: first minus second,
-  with its 95 % interval from ``low`` to ``high``; ``n``: data sets that both have a value for.
+  with its 95 % interval from ``low`` to ``high``; ``n``: data sets for which both have a value.
 - ``p_value`` of no difference; ``adjusted_p_value`` by Holm's correction over ``family``.
-- Of percentages: ``only_first`` and ``only_second``, data sets on which only one succeeds; ``failed_ids``: estimates of
-  the first on those where only the second does.
+- For percentages: ``only_first`` and ``only_second``, data sets on which only one succeeds; ``failed_ids``: estimates
+  of the first where only the second succeeds.
 """
 
 from collections.abc import Iterator
@@ -27,11 +27,11 @@ from ctid_cli.reporting.table_result import TableResult, labels_of, named, notes
 from ctid_cli.storage.manifest import true_values
 from ctid_cli.text import count, did_you_mean
 
-#: Fewer common data sets than these say nothing.
+#: Fewest common data sets for a comparison.
 FEWEST = 5
-#: Estimates that the text lists.
+#: Most estimates that the text lists.
 LISTED = 10
-#: What is compared, and how.
+#: Compared measures, and how.
 METHODS = {
     "percent": "percentages by McNemar's mid-p test, with Tango's score interval",
     "rmse": "RMSE by the paired bootstrap (BCa)",
@@ -43,7 +43,7 @@ OWN = ("first", "second", "p_value", "adjusted_p_value", "family", "failed_ids")
 
 
 def compare_estimators(results: Results, names: str, out: Path) -> TableResult:
-    """Return the differences of two estimators, given as ``A,B``, on the data sets that both were run on."""
+    """Return the differences of two estimators, given as ``A,B``, on their common data sets."""
     first, second = _known_pair(results, names)
     rows = paired_rows(results, first, second)
     if not rows:
@@ -60,7 +60,7 @@ def compare_estimators(results: Results, names: str, out: Path) -> TableResult:
 
 
 def _known_pair(results: Results, names: str) -> list[str]:
-    """Return the two names, and refuse what is no pair of estimators."""
+    """Return the two names; refuse anything but a pair of estimators."""
     pair, every = names.split(","), [part["name"] for part in results.manifest["estimators"]]
     known = list(dict.fromkeys(every))
     if len(pair) != 2:
@@ -82,11 +82,11 @@ def paired_rows(results: Results, first: str, second: str) -> list[Row]:
     shared = records_of(labels.drop(columns=["method", *options]))
     measured = [name for name in METHODS if name != "rmse" or results.is_simulated]
     values = {name: values_of(results, name, MEASURES[name]) for name in measured}
-    # Without a rule an estimate succeeds that does not fail.
+    # Without a rule an estimate succeeds if it does not fail.
     hits = values["percent"]["value"]
     values["percent"]["value"] = hits.fillna(pd.Series(1.0 * ~results.stored.failures))
     for one, other in _pairs(results, first, second):
-        # An estimator without a start goes with the other's.
+        # An estimator without a start is compared with every start of the other.
         label = shared[other if results.place(one)[2] == "none" else one]
         label = label | {"first": methods[one], "second": methods[other]}
         for measure, found in values.items():
@@ -100,7 +100,7 @@ def paired_rows(results: Results, first: str, second: str) -> list[Row]:
 
 
 def _pairs(results: Results, first: str, second: str) -> Iterator[tuple[int, int]]:
-    """Yield the groups of both estimators that are of the same data sets, and of the same start if both have one."""
+    """Yield the groups of both estimators with the same data sets, and the same start if both have one."""
     groups = results.groups.loc[sorted(set(results.numbers.tolist()))]
     groups = groups.assign(method=[results.manifest["estimators"][k]["name"] for k in groups["estimator"]])
     pairs = groups.reset_index().merge(groups.reset_index(), on="cell", suffixes=("", "_2"))
@@ -147,8 +147,8 @@ def _table(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _lost(results: Results, frame: pd.DataFrame, first: str, second: str, out: Path) -> list[str]:
-    """Return the estimates of the first that fail on data sets where the second does not, with commands for them."""
-    # An estimate of the first can be in several rows, beside other options or starts of the second.
+    """Return the estimates of the first that fail where the second succeeds, with commands to show them."""
+    # An estimate of the first can be in several rows, with other options or starts of the second.
     ids = frame["failed_ids"].dropna().explode().dropna().unique() if "failed_ids" in frame else ()
     if not len(ids):
         return []

@@ -1,4 +1,4 @@
-"""The result of ``ctid check``: facts on a record, each with the numbers that show it, and the command to run."""
+"""Result of ``ctid check``: facts on a record with their numbers, and the suggested command."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ KEYS = {
     "response_time": ("response_time", "response_time_low", "response_time_high"),
     "delay": ("delay", "delay_early", "delay_late"),
 }
-#: A mean below this fraction of the standard deviation is what rounding leaves where a mean was subtracted.
+#: A mean below this fraction of the standard deviation is the rounding of a subtracted mean.
 ROUNDING = 1e-9
 #: Columns of numbers; the value of a signal is its mean.
 NUMBERS = ("value", "standard deviation", "low", "high")
@@ -37,11 +37,11 @@ class RecordCheckResult(Result):
 
     measurement: Measurement
     facts: RecordFacts
-    #: None where no model can be identified.
+    #: None if no model can be identified.
     command: str | None = None
 
     def sections(self) -> list[Section]:
-        """Return facts, numbers, and the command to run."""
+        """Return facts, numbers, and the suggested command."""
         measurement, facts = self.measurement, self.facts
         columns = ", ".join(f"{role} {getattr(measurement, role)!r}" for role in ROLES)
         duration = f"{facts.duration:.6g} {measurement.time_unit or 's'}"
@@ -56,14 +56,14 @@ class RecordCheckResult(Result):
 
     @property
     def findings(self) -> list[Finding]:
-        """Return the facts in sentences, the worst first."""
+        """Facts in sentences, the worst first."""
         measured = self.measurement
         units = measured.time_unit or "s", measured.input_unit or "", measured.output_unit or ""
         return findings(self.facts, *units)
 
     @property
     def worst(self) -> Level:
-        """Return the level of the worst fact."""
+        """Level of the worst fact."""
         return self.findings[0].level
 
     def to_frame(self) -> pd.DataFrame:

@@ -1,4 +1,4 @@
-"""The measured records that a result was computed from: their files, columns and units."""
+"""Measured records of a result: their files, columns and units."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Records:
         return Records(list(map(treat, self.measurements)), self.validation and treat(self.validation))
 
     def of_fit(self, fitted: Identification) -> Records:
-        """Return the same files with their records as a fit has taken them."""
+        """Return the same files with their records as a fit has treated them."""
         measured = [
             replace(each, record=record) for each, record in zip(self.measurements, fitted.records, strict=True)
         ]
@@ -54,7 +54,7 @@ class Records:
 
     @cached_property
     def units(self) -> Units:
-        """Return the units that all records share.
+        """Units that all records share.
 
         Raises
         ------
@@ -77,12 +77,12 @@ class Records:
 
     @property
     def line(self) -> str:
-        """Files and their number of samples."""
+        """Files and number of samples."""
         return f"{self.names}: {count(sum(record.n_samples for record in self.data), 'sample')}"
 
     @property
     def notes(self) -> list[str]:
-        """What reading the records has shown, each once."""
+        """Notes from reading the records, each once."""
         return list(dict.fromkeys(note for each in self.measurements for note in each.notes))
 
     def content(self) -> dict[str, Any]:

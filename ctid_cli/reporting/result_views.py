@@ -1,4 +1,4 @@
-"""How results that are made in Python are shown: each goes with one of the result protocol."""
+"""Presentation of results that are made in Python, by the result protocol."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def result_of(shown: Any) -> Result:
 
 @dataclass(frozen=True, eq=False)
 class SingleFit(Result):
-    """What one estimator found, without the record that it was made from."""
+    """Estimate of one estimator, without its record."""
 
     fit: Fit
 
@@ -61,7 +61,7 @@ class SingleFit(Result):
         return pd.DataFrame(parameter_rows(self._parameters())).set_index("name")
 
     def plot(self) -> Any:
-        """Refuse: there is no record to draw."""
+        """Refuse to plot: there is no record to draw."""
         what = f"a single {type(self.fit).__name__} does not hold the record that it would be drawn with"
         raise UsageError(f"{what}; identify(record).plot() does")
 
@@ -75,7 +75,7 @@ class SingleFit(Result):
 
 
 class OnlineTrackResult(TrackResult):
-    """Frequencies over time, of an estimator that gives nothing else."""
+    """Frequencies over time, of an estimator without amplitudes and errors."""
 
     @classmethod
     def of(cls, track: FrequencyTrack) -> OnlineTrackResult:

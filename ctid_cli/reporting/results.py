@@ -1,4 +1,4 @@
-"""Results of experiments, read back from the folder that ``ctid run`` wrote them to."""
+"""Results of experiments, read from the folder that ``ctid run`` wrote."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Results:
 
     @property
     def failed(self) -> int:
-        """How many estimates ended in an error."""
+        """Number of estimates that ended in an error."""
         return int(self.stored.failures.sum())
 
     @property
@@ -60,24 +60,24 @@ class Results:
         return kind if kind in (None, "regular") else "irregular"
 
     def swept(self, part: str) -> list[str]:
-        """Names of the fields swept over ``data_cells`` or ``estimators``."""
+        """Return the names of the fields swept over ``data_cells`` or ``estimators``."""
         return list(dict.fromkeys(name for item in self.manifest[part] for name in item["swept"]))
 
-    # --- one table of estimates, one of errors ----------------------------------------------------------------------
+    # --- tables of estimates and errors -----------------------------------------------------------------------------
 
     @property
     def estimates(self) -> pd.DataFrame:
-        """One row for each estimate, what ``ctid export`` writes; the units of columns are in ``attrs["units"]``."""
+        """One row for each estimate, as ``ctid export`` writes it; the units of columns are in ``attrs["units"]``."""
         return self.stored.frame()
 
     @cached_property
     def groups(self) -> pd.DataFrame:
-        """Places of data cell and estimator in the plan, and start, of each group that was planned."""
+        """Places of data cell and estimator in the plan, and start, of each planned group."""
         return planned_groups(self.manifest)
 
     @cached_property
     def numbers(self) -> IndexArray:
-        """Number of the group that each estimate is in."""
+        """Group number of each estimate."""
         return group_numbers(self.stored)
 
     @cached_property
@@ -87,7 +87,7 @@ class Results:
 
     @cached_property
     def tracks(self) -> pd.DataFrame:
-        """What is measured of the frequencies of each estimate, a column for each measure; none of other estimates."""
+        """Measures of the frequencies of each estimate, a column for each measure; empty for other estimates."""
         import pandas as pd
 
         if not self.stored.has("measures"):
@@ -109,7 +109,7 @@ class Results:
 
     @property
     def is_simulated(self) -> bool:
-        """Whether there are true values of parameters."""
+        """Whether true values of parameters are known."""
         return any(map(true_values, self.manifest["data_cells"]))
 
     @cached_property
@@ -119,38 +119,38 @@ class Results:
 
 
 def out_option(out: Path) -> str:
-    """What a suggested command needs to find a results folder again."""
+    """Return the option with which a suggested command finds a results folder."""
     return "" if out == Path("results") else f" --out {shlex.quote(str(out))}"
 
 
 def shown_path(file: Path) -> str:
-    """A file as a message names it."""
+    """Return a file as shown in messages."""
     return str(file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file)
 
 
 def lookup(settings: Any, path: str) -> Any:
-    """Value at a key path such as ``noise.snr_db``; None where there is none."""
+    """Return the value at a key path such as ``noise.snr_db``; None if there is none."""
     return reduce(lambda value, key: value.get(key) if isinstance(value, Mapping) else None, path.split("."), settings)
 
 
 def experiments_in(out: Path) -> list[str]:
-    """Names of the experiments that have results under a folder."""
+    """Return the names of the experiments with results under a folder."""
     return [folder.relative_to(out).as_posix() for folder in experiment_folders(out) if folder != out]
 
 
 def find_results(out: Path, experiment: str) -> Results | None:
-    """Results of one experiment, or None if it was never run into this folder."""
+    """Return the results of one experiment, or None if it was never run into this folder."""
     return Results(out / experiment, read_stored(out / experiment)) if experiment in experiments_in(out) else None
 
 
 def read_results(out: Path, experiment: str) -> Results:
-    """Results of one experiment."""
+    """Return the results of one experiment."""
     folder = stored_folder(out, experiment)
     return Results(folder, read_stored(folder))
 
 
 def stored_folder(out: Path, experiment: str) -> Path:
-    """The folder with the results of one experiment."""
+    """Return the folder with the results of one experiment."""
     known = experiments_in(out)
     if experiment not in known:
         hint, there = did_you_mean(experiment, known) or ".", ", ".join(known) or "none"
@@ -159,7 +159,7 @@ def stored_folder(out: Path, experiment: str) -> Path:
 
 
 def differences(settings: Mapping[str, Any], reference: Mapping[str, Any], shown: Collection[str]) -> list[str]:
-    """Settings in which results differ from a reference specification."""
+    """Return the settings in which results differ from a reference specification."""
     left, right = _leaves(settings), _leaves(reference)
     common = tuple(f"estimators.{name}." for name in set(settings["estimators"]) & set(reference["estimators"]))
     found = []
@@ -170,7 +170,7 @@ def differences(settings: Mapping[str, Any], reference: Mapping[str, Any], shown
             continue
         ours, theirs = left.get(path), right.get(path)
         if path == "starts.initial_delay":
-            # Fixed delays are columns of their own; only another random range would go unnoticed.
+            # Fixed delays have their own columns; only another random range would go unnoticed.
             ours, theirs = ([item for item in side or () if isinstance(item, Mapping)] for side in (ours, theirs))
             if not ours:
                 continue

@@ -1,4 +1,4 @@
-"""What is stored of experiments: the results of ``ctid status``, ``verify``, ``merge`` and ``validate``."""
+"""Results of ``ctid status``, ``verify``, ``merge`` and ``validate``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ctid_cli.storage.merge import Merged
     from ctid_cli.storage.status import Verification
 
-#: Failed estimates that texts list.
+#: Most failed estimates that texts list.
 LISTED = 10
 #: Columns of failed estimates.
 OF_FAILURES = ("id", "estimator", "replicate", "start", "message")
@@ -36,19 +36,19 @@ _STATES = {"enough": "precise enough", "open": "goes on", "at_most": "at_most re
 
 @dataclass(frozen=True, eq=False)
 class StatusResult(Result):
-    """How much of one experiment is done, how well its measures are known, and what went wrong."""
+    """Progress of one experiment, precision of its measures, and failures."""
 
     schema = "ctid-status-1"
 
     status: ExperimentStatus
     out: Path
-    #: None where the estimates were not read.
+    #: None if the estimates were not read.
     stored: Estimates | None = None
     precision: Sequence[CellPrecision] = ()
 
     @property
     def name(self) -> str:
-        """What the numbers are of: a shard has only those of its own data sets."""
+        """Name of the experiment; a shard counts only its own data sets."""
         shard = self.status.shard
         return f"shard {shard[0]}/{shard[1]} of {self.status.experiment}" if shard else self.status.experiment
 
@@ -83,7 +83,7 @@ class StatusResult(Result):
         return [*sections, Section(sentences=self._next())]
 
     def outcomes(self) -> pd.DataFrame:
-        """Return how many estimates ended how, with the message of the first; those of failures differ."""
+        """Return the number of estimates of each outcome, with the first message; those of failures differ."""
         assert self.stored is not None
         found = np.unique(self.stored.column("status"), return_index=True, return_counts=True)
         rows = []
@@ -109,7 +109,7 @@ class StatusResult(Result):
         return [Section("Failed estimates:", [*lines, *more])] if n else []
 
     def _next(self) -> list[str]:
-        """Return what to do next."""
+        """Return the suggested next steps."""
         status = self.status
         name = status.folder.name if status.shard else status.experiment
         command = f"ctid table {name}{out_option(self.out)}"
@@ -133,7 +133,7 @@ class StatusResult(Result):
 
 @dataclass(frozen=True, eq=False)
 class Overview(Result):
-    """How much is done of every experiment in a folder."""
+    """Progress of every experiment in a folder."""
 
     experiments: Sequence[StatusResult]
     out: Path
@@ -160,7 +160,7 @@ class Overview(Result):
 
 
 def _running(progress: Mapping[str, Any]) -> str:
-    """Return who runs, since when, how far it is, and when it will have ended."""
+    """Return who runs the experiment, since when, its progress, and its expected end."""
     if progress["pid"] is None:
         return "running now"
     words = [f"running now: process {progress['pid']} on {progress['host']}"]
@@ -174,7 +174,7 @@ def _running(progress: Mapping[str, Any]) -> str:
 
 
 def first_line(message: str | None) -> str:
-    """Return how an estimate ended: a failure's message goes on with the places in the code that it came from."""
+    """Return the first line of an outcome; a failure's message continues with places in the code."""
     return (message or "").split("\n", 1)[0]
 
 
@@ -193,13 +193,13 @@ def precision_frame(cells: Sequence[CellPrecision]) -> pd.DataFrame:
 
 
 def block_sentence(cells: Sequence[CellPrecision]) -> str:
-    """Return what a finished block has brought; ``ctid status`` has the widest interval of each data cell."""
+    """Return the result of a finished block; ``ctid status`` has the widest interval of each data cell."""
     more = [cell for cell in cells if cell.state == "open"]
     return f"{len(more)} of {len(cells)} data cells need more data sets, up to {max(c.needed for c in more)}"
 
 
 def precision_sentence(cells: Sequence[CellPrecision]) -> str:
-    """Return what a run has come to: how many data sets, and whether intervals are as narrow as asked for."""
+    """Return the result of a run: its data sets, and whether intervals are as narrow as requested."""
     if not cells or any(cell.state == "open" for cell in cells):
         return ""
     sizes, missed = [cell.needed for cell in cells], sum(cell.state == "at_most" for cell in cells)
@@ -235,7 +235,7 @@ def _with_unit(half_width: float, widest: Widest) -> str:
 
 @dataclass(frozen=True, eq=False)
 class VerificationResult(Result):
-    """Whether what is stored of an experiment is what was written."""
+    """Whether the stored files of an experiment are intact."""
 
     schema = "ctid-verify-1"
 
@@ -249,14 +249,14 @@ class VerificationResult(Result):
         return [Section(f"{self.content()['experiment']}: {verdict}", frame=files)]
 
     def content(self) -> dict[str, Any]:
-        """Return what was found for JSON."""
+        """Return the findings for JSON."""
         about = {"experiment": self.found.folder.relative_to(self.out).as_posix(), "folder": str(self.found.folder)}
         return about | {"intact": self.found.is_intact, "findings": [asdict(each) for each in self.found.findings]}
 
 
 @dataclass(frozen=True, eq=False)
 class MergeResult(Result):
-    """What a merge of shards has made."""
+    """Outcome of a merge of shards."""
 
     schema = "ctid-merge-1"
 
@@ -264,7 +264,7 @@ class MergeResult(Result):
     out: Path
 
     def sections(self) -> list[Section]:
-        """Return counts, what is missing, and the next command."""
+        """Return counts, missing parts, and the next command."""
         merged = self.merged
         head = f"{merged.experiment}: {merged.stored} of {merged.planned} estimates in {merged.folder}"
         lines = [f"{head} ({merged.new} new, from {merged.sources} folders)"]
@@ -274,13 +274,13 @@ class MergeResult(Result):
         return [Section(lines=lines)]
 
     def content(self) -> dict[str, Any]:
-        """Return what was made for JSON."""
+        """Return the outcome for JSON."""
         return asdict(self.merged) | {"folder": str(self.merged.folder)}
 
 
 @dataclass(frozen=True, eq=False)
 class ValidationResult(Result):
-    """How much work a specification without mistakes asks for."""
+    """Amount of work of a specification without mistakes."""
 
     schema = "ctid-validate-1"
 
@@ -289,7 +289,7 @@ class ValidationResult(Result):
     data_sets: int
     data_cells: int
     estimates: int
-    #: Most data sets of a cell, where their number follows from a precision.
+    #: Most data sets of a cell, if their number follows from a precision.
     at_most: int | None
     warnings: Sequence[str] = ()
     #: Whether data are simulated, and none of them with noise.

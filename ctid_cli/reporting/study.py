@@ -1,4 +1,4 @@
-"""The studies that are shipped with the program: one folder each, with its ``study.yaml``."""
+"""Studies that are shipped with the program: one folder each, with its ``study.yaml``."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 InitialDelay = float | Literal["random"] | None
 
-#: The study that a bare table number means.
+#: The study of table numbers without a name.
 DEFAULT_STUDY = "useful-redundancy"
-#: Name under which modules of studies are imported, whatever the working directory holds.
+#: Package name of the modules of studies, independent of the working directory.
 _PACKAGE = "ctid_experiments"
 
 
@@ -42,7 +42,7 @@ class StudyTable:
 
     @property
     def experiments(self) -> list[str]:
-        """Names of the experiments that fill it."""
+        """Names of its experiments."""
         return list(self.published["experiment"].unique())
 
 
@@ -52,25 +52,25 @@ class Study:
 
     study: str
     title: str
-    #: Of every experiment ``config``, its specification relative to ``configs``, and ``sampling`` where tables show it.
+    #: For every experiment ``config``, its specification relative to ``configs``, and ``sampling`` if tables show it.
     experiments: Mapping[str, Mapping[str, str]]
-    #: Experiments that each figure is drawn from, by the last parts of their names; none where it is computed.
+    #: Experiments of each figure, by the last parts of their names; none if it is computed.
     figures: Mapping[str, Sequence[str]]
     #: Function in ``tables.py`` that writes each published text.
     texts: Mapping[str, str]
     #: Published numbers by file: a function in ``tables.py`` that makes ``rows`` of the results of one experiment, its
     #: ``columns`` if not all keys, and its ``experiments`` if not all.
     numbers: Mapping[str, Mapping[str, Any]]
-    #: Experiments that each function in ``claims.py`` is asked about, one call for each list.
+    #: Experiments of each function in ``claims.py``, one call for each list.
     claims: Mapping[str, Sequence[Sequence[str]]]
-    #: Settings with which the first data set of an experiment is computed again by a small reproduction.
+    #: Settings with which a small reproduction computes the first data set of an experiment.
     first: Mapping[str, Sequence[str]]
-    #: ``authors``, ``title`` and ``identifier`` of the article that is reproduced.
+    #: ``authors``, ``title`` and ``identifier`` of the reproduced article.
     source: Mapping[str, str] = field(default_factory=dict)
-    #: What the percentages of its tables count, and from how many data sets the published ones are.
+    #: What the percentages of its tables count, and the number of data sets of the published ones.
     success: str = ""
     published_data_sets: int = 0
-    #: What each method does, and those that must reach the published percentages.
+    #: Description of each method, and methods that must reach the published percentages.
     methods: Mapping[str, str] = field(default_factory=dict)
     must_reach: Sequence[str] = ()
     #: Key path in a specification of every setting that is a column of the tables.
@@ -79,22 +79,22 @@ class Study:
 
     @property
     def name(self) -> str:
-        """Name by which commands know it."""
+        """Name in commands."""
         return self.study
 
     @property
     def citation(self) -> str:
-        """The article that is reproduced; empty where there is none."""
+        """Reproduced article; empty if there is none."""
         return "{authors}: {title} ({identifier})".format(**self.source) if self.source else ""
 
     @property
     def folder(self) -> Path:
-        """Where its files lie."""
+        """Folder of its files."""
         return data_folder("experiments") / self.name.replace("-", "_")
 
     @property
     def published(self) -> Path:
-        """The folder that it is published in, also in an installed package."""
+        """Folder in which it is published, also in an installed package."""
         return data_folder("results/published") / self.folder.name
 
     @property
@@ -103,23 +103,23 @@ class Study:
         return {name: item["config"] for name, item in self.experiments.items()}
 
     def experiment(self, short: str) -> str:
-        """An experiment by the last part of its name."""
+        """Return an experiment by the last part of its name."""
         return f"{self.name}/{short}"
 
     def config(self, short: str) -> Path:
-        """Specification of one of its experiments."""
+        """Return the specification of one of its experiments."""
         return data_folder("configs") / self.configs[self.experiment(short)]
 
     def only(self, names: Collection[str]) -> Study:
-        """The study with some of its experiments."""
+        """Return the study with some of its experiments."""
         return replace(self, experiments={name: item for name, item in self.experiments.items() if name in names})
 
     def plan(self, short: str, overrides: Sequence[str] = ()) -> Plan:
-        """Plan of one of its experiments."""
+        """Return the plan of one of its experiments."""
         return build_plan(load_spec(self.config(short), overrides))
 
     def module(self, name: str) -> Any:
-        """One of its modules, always from the folder that is shipped with the program."""
+        """Return one of its modules, always from the folder that is shipped with the program."""
         if _PACKAGE not in sys.modules:
             package = ModuleType(_PACKAGE)
             package.__path__ = [str(data_folder("experiments"))]
@@ -157,16 +157,16 @@ def data_folder(name: str) -> Path:
 
 @cache
 def all_studies() -> dict[str, Study]:
-    """Every study by its name."""
+    """Return every study by its name."""
     files = sorted(data_folder("experiments").glob("*/study.yaml"))
-    # Written in C where PyYAML was built with it: every run looks here for its tables.
+    # The C loader of PyYAML if available: every run reads the studies for its tables.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     studies = [Study(**yaml.load(file.read_text(encoding="utf-8"), loader)) for file in files]
     return {study.name: study for study in studies}
 
 
 def find_study(name: str = DEFAULT_STUDY) -> Study:
-    """A study by its name."""
+    """Return a study by its name."""
     studies = all_studies()
     if name not in studies:
         raise UsageError(f"there is no study named {name!r}; there are {', '.join(studies)}")
@@ -174,7 +174,7 @@ def find_study(name: str = DEFAULT_STUDY) -> Study:
 
 
 def find_studies(names: Sequence[str]) -> list[Study]:
-    """Studies by their names, all without any; by names of experiments the studies with these experiments only."""
+    """Return studies by their names, by default all; by names of experiments the studies with these only."""
     chosen: dict[str, list[str]] = {}
     for name in names or all_studies():
         study = find_study(name.partition("/")[0])
@@ -186,11 +186,11 @@ def find_studies(names: Sequence[str]) -> list[Study]:
 
 
 def last_part(experiment: str) -> str:
-    """An experiment's name without that of its study."""
+    """Return an experiment's name without that of its study."""
     return experiment.rpartition("/")[2]
 
 
 def tables_of(experiment: str) -> list[int]:
-    """Numbers of the default study's tables that an experiment fills."""
+    """Return the numbers of the default study's tables that an experiment fills."""
     tables = find_study().printed_tables
     return [number for number, table in tables.items() if experiment in {row["experiment"] for row in table["rows"]}]

@@ -1,4 +1,4 @@
-"""Tables of the published study, our percentages beside those of the article, and tables by name."""
+"""Tables of the published study with our percentages and those of the article, and tables by name."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ from ctid_cli.storage.columns import COUNTS
 from ctid_cli.storage.folder import InUseError
 from ctid_cli.text import did_you_mean, listed
 
-#: What the table shows of every cell, one line for each.
+#: Lines of every cell of the table.
 LINES = ("%", "95 %", "published", "time")
 
 
 def build_tables(
     names: Sequence[str], out: Path, *, committed: bool = False, measures: Sequence[str] = ()
 ) -> TableResult:
-    """Return the tables asked for; committed ones stand in for those of which nothing was run, if they may."""
+    """Return the requested tables; committed ones replace those that were not run, if allowed."""
     study, tables = find_study(), []
     if measures:
         names = [results.experiment for results in experiments(names, out, "--measure")]
@@ -73,7 +73,7 @@ def build_tables(
 
 
 def experiments(names: Sequence[str], out: Path, option: str) -> list[Results]:
-    """Return the results of the experiments that an option is about."""
+    """Return the results of the experiments of an option."""
     if not names:
         raise UsageError(f"{option} needs the name of an experiment: ctid table NAME {option} …")
     return [read_results(out, name) for name in names]
@@ -90,7 +90,7 @@ def _results_called(name: str, study: Study, out: Path) -> Results:
 
 
 def study_table(study: Study, number: int, out: Path, *, committed: bool = False) -> TableResult:
-    """Return one published table with our percentages in it, as far as its experiments were run."""
+    """Return one published table with our percentages, as far as its experiments were run."""
     table = study.tables[number]
     notes: list[str] = []
     known: set[str] = set()
@@ -116,7 +116,7 @@ def study_table(study: Study, number: int, out: Path, *, committed: bool = False
 
 
 def _results_of(study: Study, name: str, out: Path) -> tuple[Results | None, set[str], list[str]]:
-    """Return the results of one experiment, the estimators that it has or should have, and remarks."""
+    """Return the results of one experiment, its actual and expected estimators, and remarks."""
     config = data_folder("configs") / study.experiments[name]["config"]
     specification = load_spec(config).canonical()
     command = f"ctid run {shown_path(config)}{out_option(out)}"
@@ -132,7 +132,7 @@ def _results_of(study: Study, name: str, out: Path) -> tuple[Results | None, set
 
 
 def _departures(results: Results, specification: Mapping[str, Any], shown: set[str], command: str) -> Iterator[str]:
-    """Yield in what results are not those of the published specification."""
+    """Yield the differences of results from the published specification."""
     absent = [method for method in specification["estimators"] if method not in results.settings["estimators"]]
     if absent:
         which = f"the estimator {', '.join(absent)} of its specification"
@@ -150,7 +150,7 @@ def study_frame(study: Study, table: StudyTable, found: Mapping[str, Results]) -
     own = [percentage_frame(found[name], table.number, study.fields) for name in table.experiments if name in found]
     cells = [table.published]
     if own:
-        # Estimates without a start stand in the tables of fixed and of random starts.
+        # Estimates without a start are in the tables of fixed and of random starts.
         ours = pd.concat(own, ignore_index=True).drop(columns="published_percent")
         ours = ours[ours["initial_delay"].isna() | ((ours["initial_delay"] == "random") == random)]
         beside = ours.merge(table.published, on=keys, how="left")
@@ -164,18 +164,18 @@ def study_frame(study: Study, table: StudyTable, found: Mapping[str, Results]) -
 
 
 def _sorted(study: Study, frame: pd.DataFrame) -> pd.DataFrame:
-    """Return rows by sampling, settings and method: methods with an experiment of their own stand beside the others."""
+    """Return rows by sampling, settings and method, also for methods from different experiments."""
     orders = {name: frame[name].unique().tolist() for name in ("sampling", *study.fields)}
     orders["method"] = [*dict.fromkeys([*study.methods, *frame["method"]])]
     places = pd.DataFrame({name: frame[name].map(order.index) for name, order in orders.items()})
     return frame.loc[places.sort_values([*places], kind="stable").index].reset_index(drop=True)
 
 
-# --- for people -----------------------------------------------------------------------------------------------------
+# --- presentation ---------------------------------------------------------------------------------------------------
 
 
 def study_sections(study: Study, table: StudyTable, frame: pd.DataFrame, options: Sequence[str] = ()) -> list[Section]:
-    """Return a published table, all its cells together, and what its columns mean."""
+    """Return a published table, the pool of all its cells, and the meaning of its columns."""
     published = f"Published: {study.published_data_sets} data sets, {study.citation}."
     foot = f"{RULE} {TIME}. {published}"
     if startless := frame["method"][frame["initial_delay"].isna()].unique().tolist():
@@ -193,7 +193,7 @@ def study_sections(study: Study, table: StudyTable, frame: pd.DataFrame, options
 
 
 def _lines_by_delay(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return initial delays across, and of each method a line for each of ``LINES``."""
+    """Return initial delays across, and for each method a line for each of ``LINES``."""
     rows, startless = records_of(frame), frame["initial_delay"].isna()
     labels = frame[["sampling"]].join(labels_of(frame, "method").drop(columns="initial delay", errors="ignore"))
     place = labels.agg("\n".join, axis=1) + startless.astype(str)
@@ -217,7 +217,7 @@ def _lines_by_delay(frame: pd.DataFrame) -> pd.DataFrame:
     long = one_line_each.rename_axis([*keys, "under", "line"]).rename("text").reset_index()
     lines = pivot(long, [*keys, "line"], "under", ["text"])[[*keys, "line", *titles]]
     lines = lines[(lines[titles] != "").any(axis=1)].reset_index(drop=True)
-    # A label that the line above has already said is left out, as in a printed table.
+    # A label equal to the one above is left out, as in a printed table.
     repeated = lines[keys].eq(lines[keys].shift()).cummin(axis=1)
     lines[keys] = lines[keys].mask(repeated, "")
     return lines.rename(columns={"line": "initial delay"})
@@ -233,7 +233,7 @@ def pooled_frame(study: Study, table: StudyTable, frame: pd.DataFrame, options: 
     """Return each method, with each combination of its swept options, over all cells of a published table.
 
     There is no interval: cells of one row share their data sets, so their estimates are not independent trials. The
-    published percentage is the mean over the cells that have estimates, or over all cells where none has [%].
+    published percentage is the mean over the cells with estimates, or over all cells if none has any [%].
     """
     places = table.published[["experiment", *study.fields]].drop_duplicates()
     samplings = places["experiment"].map({name: one["sampling"] for name, one in study.experiments.items()})
@@ -286,7 +286,7 @@ def read_tables(file: Path) -> pd.DataFrame:
 
 
 def _initial_delay(text: str) -> float | str:
-    """Return an initial delay of a table, which may be a word."""
+    """Return an initial delay of a table, a number or a word."""
     try:
         return float(text)
     except ValueError:
@@ -294,7 +294,7 @@ def _initial_delay(text: str) -> float | str:
 
 
 def environment_of(published: Path) -> dict[str, Any] | None:
-    """Return the commit and the sessions that made the published results in a folder; None where there are none."""
+    """Return the commit and the sessions of the published results in a folder; None if there are none."""
     try:
         content: dict[str, Any] = json.loads((published / "environment.json").read_text(encoding="utf-8"))
     except OSError:
@@ -303,6 +303,6 @@ def environment_of(published: Path) -> dict[str, Any] | None:
 
 
 def made_by(published: Path) -> str:
-    """Return which code computed the published results in a folder, as a participle clause; empty if unknown."""
+    """Return the code that computed the published results in a folder, as a participle clause; empty if unknown."""
     environment = environment_of(published)
     return f"computed at commit {environment['commit'][:12]}" if environment else ""

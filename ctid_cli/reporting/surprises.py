@@ -1,8 +1,8 @@
-"""What results show that theory does not expect, in sentences, each with its reason where the specification holds one.
+"""Deviations of results from theory in sentences, each with its reason if the specification gives one.
 
-Of every parameter in every cell are tested its bias, its standard errors, the coverage of its intervals and its root
-mean square error. Holm's correction over all tests of a table keeps the chance of any sentence about an experiment that
-is as theory expects it below ``LEVEL``.
+The bias, the standard errors, the coverage of intervals and the root mean square error of every parameter in every cell
+are tested. Holm's correction over all tests of a table limits the probability of any sentence about an experiment that
+agrees with theory to ``LEVEL``.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,11 +21,11 @@ from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.simulation.expected_accuracy import why_biased
 from ctid_cli.specification.joint_warnings import joint_warnings
 
-#: Chance of a sentence about an experiment that is as theory expects it.
+#: Probability of a sentence about an experiment that agrees with theory.
 LEVEL = 0.05
-#: An RMSE of the delay so far above theory is that of a search which ends in several minima.
+#: An RMSE of the delay this far above theory indicates a search that ends in several minima.
 FAR = 2.0
-#: Each kind of departure in words, from its size.
+#: Each kind of deviation in words, from its size.
 PHRASES = {
     "bias": "biased by {:.2g} standard errors",
     "small": "standard errors {:.2g} times too small",
@@ -51,7 +51,7 @@ class Finding(NamedTuple):
 
 
 def surprises(results: Results) -> list[str]:
-    """Return what the estimates of simulated systems show that theory does not expect, one sentence for each reason."""
+    """Return the deviations of estimates of simulated systems from theory, one sentence for each reason."""
     if not results.is_simulated:
         return []
     tested = list(_tested(results))
@@ -77,7 +77,7 @@ def _tested(results: Results) -> Iterator[Finding]:
 
 
 def _reasons(results: Results, finding: Finding, far: set[str]) -> list[str]:
-    """Return what the specification holds that explains a finding, what matters most first."""
+    """Return the reasons for a finding in the specification, the most important first."""
     kind, plan, (k, j, start) = finding.test.kind, results.plan, results.place(finding.group)
     source = None if plan is None else plan.data_cells[k].source
     if plan is None or not isinstance(source, SimulatedSource):
@@ -106,7 +106,7 @@ def _reasons(results: Results, finding: Finding, far: set[str]) -> list[str]:
 
 
 def describe(name: str, reasons: Sequence[str], found: Sequence[Finding], tested: Sequence[Finding]) -> str:
-    """Return what was found of an estimator for one reason: the worst case of each kind, and in how many cells."""
+    """Return the findings on an estimator for one reason: the worst case of each kind, and the number of cells."""
     phrases = []
     for kind, phrase in PHRASES.items():
         if members := [finding for finding in found if finding.test.kind == kind]:
@@ -119,7 +119,7 @@ def describe(name: str, reasons: Sequence[str], found: Sequence[Finding], tested
 
 
 def _swept(labels: Row, tested: Sequence[Finding]) -> Iterator[str]:
-    """Return the settings that differ between cells, with their values in one of them."""
+    """Yield the settings that differ between cells, with their values in one of them."""
     for key in (*settings_of(labels), "initial_delay"):
         if len({str(finding.labels[key]) for finding in tested}) > 1:
             title = "initial delay" if key == "initial_delay" else setting_title(key)

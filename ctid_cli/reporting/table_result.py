@@ -1,4 +1,4 @@
-"""Tables of experiments: rows for programs, and the same side by side for people."""
+"""Tables of experiments: rows for programs, and formatted tables."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ SETTLING = (
     "settling: time until the slowest tone is in the band to stay [s], from the start and after the last step; - is "
     "never, or unknown. rms: root-mean-square error of each tone over the window [rad/s]; medians over the data sets."
 )
-#: Titles of measured frequencies that are not those of their keys.
+#: Titles of measured frequencies that differ from their keys.
 TITLES = {"median_settling_time": "settling", "median_settling_after_step": "after step", "false_alarms": "alarms"}
-#: What a rule of success counts, by its key.
+#: Meaning of a rule of success, by its key.
 SUCCESS: Mapping[str, Callable[[float, str], str]] = {
     "delay_relative_error": lambda value, _: f"delay estimate lies within {100 * value:g} % of the true delay",
     "parameter_relative_error": lambda value, _: f"parameters all lie within {100 * value:g} % of the true ones",
@@ -54,29 +54,29 @@ SUCCESS: Mapping[str, Callable[[float, str], str]] = {
     ),
     "fit_percent": lambda value, _: f"model fits to at least {value:g} %",
 }
-#: What rows of a measured record have besides the keys of every table.
+#: Additional keys in rows of a measured record.
 OF_RECORDS = (
     *("id", "status", "delay", "numerator", "denominator", "standard_errors"),
     *("fit_percent", "validation_fit_percent"),
 )
-#: Measures that single large errors can determine. That is said where their Monte Carlo error is above a share of them
-#: and there are at least a few data sets: of normal errors the share is 1/sqrt(2 n), 0.22 of ten.
+#: Measures that single large errors can determine. A note is added if their Monte Carlo error exceeds a share of them
+#: with at least a few data sets: for normal errors the share is 1/sqrt(2 n), 0.22 for ten.
 OF_SQUARES, WIDE, FEW = ("rmse", "deviation"), 0.5, 10
-#: Estimators, and estimates of a measured record, before a table goes on below.
+#: Most estimators, and estimates of a measured record, side by side; a wider table continues below.
 ESTIMATORS_PER_BLOCK = 2
 ESTIMATES_PER_BLOCK = 3
 
 
 @dataclass(frozen=True, eq=False)
 class TableResult(Result):
-    """Rows of one or several tables, how they are shown, and what to know of them."""
+    """Rows of one or several tables, with their presentation and notes."""
 
     rows: Sequence[Row]
     shown: Sequence[Section]
     remarks: Sequence[str] = ()
 
     def sections(self) -> list[Section]:
-        """Return the tables for people."""
+        """Return the formatted tables."""
         remarks = [f"Note: {remark}" for remark in self.remarks]
         return [*self.shown, *([Section(notes=remarks)] if remarks else [])]
 
@@ -100,7 +100,7 @@ def joined(tables: Sequence[TableResult]) -> TableResult:
 
 
 def labels_of(frame: pd.DataFrame, *others: str, options: Sequence[str] = ()) -> pd.DataFrame:
-    """Return as text what tells rows apart: swept fields but ``options``, starts, and other keys that any row has."""
+    """Return the identifying columns as text: swept fields but ``options``, starts, and other keys that any row has."""
     keys = [key for key in settings_of(frame) if key not in options]
     texts = {setting_title(key): [setting_text(key, value) for value in frame[key]] for key in keys if _has(frame, key)}
     if _has(frame, "initial_delay"):
@@ -151,13 +151,13 @@ def interval_text(row: Row) -> str:
 
 
 def time_of(row: Row) -> float | None:
-    """Return the time of one estimate: that of the processor, or of the clock where only that is stored."""
+    """Return the time of one estimate: processor time, or wall time if only that is stored."""
     time: float | None = row["median_cpu_seconds"]
     return row["median_seconds"] if time is None else time
 
 
 def notes_of(results: Results, out: Any) -> list[str]:
-    """Return what to know of the results themselves."""
+    """Return notes on the results."""
     notes = []
     if results.failed:
         command = f"ctid status {results.experiment}{out_option(out)}"
@@ -198,7 +198,7 @@ def title_of(key: str) -> str:
 
 
 def success_sentence(settings: Mapping[str, Any]) -> str:
-    """Return what the percentages of an experiment count."""
+    """Return the meaning of the percentages of an experiment."""
     rule = settings.get("success") or {}
     soon = f" within {rule['by']:g} s" if rule.get("by") is not None else ""
     parts = [sentence(rule[key], soon) for key, sentence in SUCCESS.items() if rule.get(key) is not None]
@@ -208,7 +208,7 @@ def success_sentence(settings: Mapping[str, Any]) -> str:
 
 
 def _by_estimator(results: Results, frame: pd.DataFrame, cells: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return percentages, settings of the data and starts down, estimators with their options across."""
+    """Return percentages: settings of the data and starts down, estimators with their options across."""
     options = results.swept("estimators")
     labels = labels_of(frame, options=options)
     labels = labels if len(labels.columns) else labels.assign(experiment=results.experiment)
@@ -264,7 +264,7 @@ def _measured(frame: pd.DataFrame, measures: Mapping[str, Measure]) -> pd.DataFr
     """Return swept fields, starts, estimators and parameters down, measures across."""
     labels = labels_of(frame, "method", "parameter")
     place, counted = labels.agg("\n".join, axis=1), counted_in(frame)
-    # What most measures count; a measure of fewer estimates has its number beside it.
+    # The count of most measures; a measure of fewer estimates shows its own.
     most = counted.groupby(place).transform("max")
     first = frame[["failed", "without_value"]].assign(fewer=counted < most, place=place)
     first = first.sort_values("fewer", kind="stable").groupby("place").first()
@@ -282,13 +282,13 @@ def _measured(frame: pd.DataFrame, measures: Mapping[str, Measure]) -> pd.DataFr
 
 
 def _title(name: str, measure: Measure) -> str:
-    """Return a measure with its unit; one in the unit of its parameter has none."""
+    """Return a measure with its unit, unless that is the unit of its parameter."""
     of_parameter = measure.source == "errors" and measure.unit != "%"
     return name if of_parameter or measure.unit == "-" else f"{name} [{measure.unit}]"
 
 
 def _cell(row: Row, n: int, most: int) -> str:
-    """Return a value with its Monte Carlo error or interval; its number of estimates where others have more."""
+    """Return a value with its Monte Carlo error or interval, and its number of estimates if others have more."""
     if row["value"] is None:
         return "-"
     own = "" if n == most else f" (n {n})"
@@ -338,7 +338,7 @@ def _with_error(item: UncertainValue) -> str:
 
 
 def start_text(label: str) -> str:
-    """Return the label of a start, with its unit where it is a delay."""
+    """Return the label of a start, with its unit if it is a delay."""
     try:
         return f"{float(label):g} s"
     except ValueError:

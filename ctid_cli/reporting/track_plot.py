@@ -1,4 +1,4 @@
-"""Figures of a track: its tones over time, the signal with its spectrogram, and spectra of what the tones leave."""
+"""Figures of a track: its tones over time, the signal with its spectrogram, and spectra of the residual."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TURN = 2.0 * np.pi
-#: Up to this number of tones get a panel each, which shows how far they move; more share one.
+#: Up to this number of tones get a panel each, which shows their variation; more share one.
 MOST_PANELS = 5
-#: A legend of more tones would be longer than the figure.
+#: Most tones in a legend.
 MOST_NAMED = 16
-#: The axis of a panel shows the central part of the valid rows, and so much more on both sides.
+#: The axis of a panel shows the central part of the valid rows, and this much more on both sides.
 SHOWN_PERCENT = 98.0
 MARGIN = 0.35
 #: Amplitudes that differ by more than this factor are drawn on a logarithmic axis.
@@ -30,15 +30,15 @@ LOGARITHMIC = 10.0
 BEYOND = 2.0
 #: Range of a spectrogram [dB].
 RANGE_DB = 70.0
-#: Missing lines that have their frequency beside them, and how far the axes go below the median of what is left.
+#: Most missing lines labelled with their frequency, and depth of the axes below the median of the residual.
 NAMED_LINES = 8
 BELOW = 30.0
 
 
 def track_drawing(track: Track, start: float, unit: str | None, title: str) -> Drawing:
-    """Return the figure of frequencies over time, with amplitudes below where they are known."""
+    """Return the figure of frequencies over time, with amplitudes below if they are known."""
     t, count = start + track.t, track.omega.shape[1]
-    # The highest tone on top, as on a sheet of music; a tone that is never valid lies lowest.
+    # The highest tone on top; a tone that is never valid lies lowest.
     order = np.argsort([-_middle(track, k) for k in range(count)], kind="stable").tolist()
     panels = [[k] for k in order] if 0 < count <= MOST_PANELS else [order]
     has_amplitudes = bool(np.isfinite(track.amplitudes).any())
@@ -76,7 +76,7 @@ def _draw_frequencies(axes: Any, track: Track, t: Array, tones: list[int], colou
     shown = hertz[:, tones][valid[:, tones]] if valid[:, tones].any() else hertz[:, tones]
     shown = shown[np.isfinite(shown)]
     if shown.size:
-        # What strays may leave the axes.
+        # Stray values may lie outside the axes.
         rest = 0.5 * (100.0 - SHOWN_PERCENT)
         low, high = np.percentile(shown, [rest, 100.0 - rest])
         room = max(MARGIN * (high - low), 1e-4 * high, 1e-12)
@@ -108,7 +108,7 @@ def _draw_valid(
     values = np.where(valid, values, np.nan)
     if np.isfinite(values - errors).any():
         axes.fill_between(t, values - errors, values + errors, color=colour, alpha=0.25, linewidth=0.0)
-    # A valid row between two that are not would be no line.
+    # A valid row between two invalid ones would not be visible as a line.
     known = np.isfinite(values)
     lonely = known & ~np.roll(known, 1) & ~np.roll(known, -1)
     style = {"color": colour, "linestyle": line, "linewidth": 1.2, "marker": ".", "markersize": 3, "label": label}
@@ -116,7 +116,7 @@ def _draw_valid(
 
 
 def _shade(axes: Any, t: Array, grey: BoolArray) -> None:
-    """Draw grey bands where nothing that is drawn is valid."""
+    """Draw grey bands where no drawn value is valid."""
     if t.size < 2:
         return
     half = 0.5 * float(t[1] - t[0])
@@ -126,7 +126,7 @@ def _shade(axes: Any, t: Array, grey: BoolArray) -> None:
 
 
 def highest_shown(track: Track, interval: float) -> float:
-    """Return where the frequency axes end [Hz]."""
+    """Return the end of the frequency axes [Hz]."""
     frequencies = [*track.omega[np.isfinite(track.omega)].tolist(), *(line.omega for line in track.missing)]
     nyquist = 0.5 / interval
     return min(nyquist, BEYOND * max(frequencies) / TURN) if frequencies else nyquist
@@ -154,7 +154,7 @@ def signal_drawing(signal: SampledSignal, track: Track) -> Drawing:
 
 
 def spectra_drawing(left: LeftOver, track: Track, unit: str | None) -> Drawing:
-    """Return the figure of amplitude spectra of the signal and of what the tones leave, with missing lines marked."""
+    """Return the figure of amplitude spectra of the signal and of the residual, with missing lines marked."""
 
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()

@@ -1,4 +1,4 @@
-"""The result of ``ctid track``: the tones of a recorded signal."""
+"""Result of ``ctid track``: the tones of a recorded signal."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ from ctid_cli.tones.track import Track
 from ctid_cli.tones.track_warnings import track_warnings
 
 TURN = 2.0 * math.pi
-#: Factor by which an amplitude changes that is said to grow or fall [-].
+#: Factor from which a change of an amplitude is reported [-].
 MUCH = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class TrackResult(PagedResult):
-    """Tones over time, with the signal that they were found in, where it is known."""
+    """Tones over time, with their signal if it is known."""
 
     schema = "ctid-track-1"
 
     track: Track
     signal: SampledSignal | None = None
-    #: Largest standard error of a valid row that was asked for [Hz].
+    #: Requested largest standard error of a valid row [Hz].
     accuracy: float | None = None
 
     @property
     def fine(self) -> str:
-        """What is said where nothing is to be warned of."""
+        """Sentence if there are no warnings."""
         return (
             "Nothing that was tested speaks against these tones: nearly all rows are valid, and no line is left over."
         )
 
     def sections(self) -> list[Section]:
-        """Return what was read and chosen, the tones, and warnings."""
+        """Return signal, choices, tones, and warnings."""
         head = [] if self.signal is None else [signal_line(self.signal), *self.signal.notes]
         warnings = [f"- {warning}" for warning in track_warnings(self.track)]
         return [
@@ -60,7 +60,7 @@ class TrackResult(PagedResult):
         ]
 
     def tones(self) -> list[Section]:
-        """Return a table of the tones and what its numbers are; columns of which nothing is known are left out."""
+        """Return a table of the tones and the meaning of its numbers; columns without values are left out."""
         track, signal = self.track, self.signal
         if not track.omega.shape[1]:
             return []
@@ -88,7 +88,7 @@ class TrackResult(PagedResult):
         return [Section.table(rows, columns, notes=[note, *self._changes()])]
 
     def _changes(self) -> Iterator[str]:
-        """Yield which amplitudes grow or fall much, from the first to the last tenth of the valid rows of the tone."""
+        """Yield amplitudes that grow or decay much, from the first to the last tenth of the valid rows of the tone."""
         unit = f" {self.signal.unit}" if self.signal and self.signal.unit else ""
         for k in range(self.track.omega.shape[1]):
             amplitudes = self.track.amplitudes[self.track.valid[:, k] & np.isfinite(self.track.amplitudes[:, k]), k]
@@ -108,7 +108,7 @@ class TrackResult(PagedResult):
         return track_drawing(self.track, signal.start, signal.unit, Path(signal.file).name)
 
     def page_head(self) -> tuple[str, str]:
-        """Return the title of the page, and how many tones there are."""
+        """Return the title of the page, and the number of tones."""
         track, signal = self.track, self.shown_signal
         tones = count(track.omega.shape[1], "tone")
         share = 100.0 * float(track.valid.sum() / max(track.there.sum(), 1))
@@ -117,7 +117,7 @@ class TrackResult(PagedResult):
         return f"Tones of {signal.file}", f"{tones}{valid} (method: {METHOD}).{lines}"
 
     def chapters(self) -> Iterator[Chapter]:
-        """Return the signal, its tones, and what they leave."""
+        """Yield the signal, its tones, and the residual."""
         track, signal = self.track, self.shown_signal
         bands = ", with bands of one standard error" if np.isfinite(track.error).any() else ""
         caption = f"Frequencies and amplitudes over time{bands}; grey where no tone that is drawn is valid."
@@ -131,16 +131,16 @@ class TrackResult(PagedResult):
 
     @property
     def shown_signal(self) -> SampledSignal:
-        """The signal, without the folder that it is in."""
+        """Signal without its folder."""
         assert self.signal is not None
         return replace(self.signal, file=shown(self.signal.file))
 
     def cited(self) -> list[str]:
-        """Return the article whose method it is."""
+        """Return the article on the method."""
         return ["rife1976"]
 
     def chosen(self) -> list[str]:
-        """Return what was chosen and why, and what a standard error must not exceed where one is known."""
+        """Return the choices with their reasons, and the largest admitted standard error if it is known."""
         if not np.isfinite(self.track.error).any():
             return list(self.track.reasons)
         limit = f"{USUAL_ACCURACY:g} of the tone's frequency" if self.accuracy is None else f"{self.accuracy:g} Hz"
@@ -198,7 +198,7 @@ class TrackResult(PagedResult):
 
 
 def _left(track: Track, signal: SampledSignal, left: LeftOver | None) -> Section:
-    """What the tones leave of the signal."""
+    """Return the residual of the signal without the tones."""
     if left is None:
         return Section(notes=["Nowhere are all tones known, so that nothing can be compared."])
     unit = f" {signal.unit}" if signal.unit else ""
@@ -216,7 +216,7 @@ def _left(track: Track, signal: SampledSignal, left: LeftOver | None) -> Section
 
 
 def signal_line(signal: SampledSignal) -> str:
-    """Return what was read."""
+    """Describe the signal that was read."""
     end = signal.start + (signal.samples.size - 1) * signal.interval
     gaps = f", {count(signal.missing, 'sample')} missing" if signal.missing else ""
     head = f"{signal.file}: {count(signal.samples.size, 'sample')} of {signal.column!r} from {signal.start:.6g} to "

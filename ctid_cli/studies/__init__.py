@@ -1,1 +1,1 @@
-"""Reproduced studies: what belongs to each, its claims, its figures, and what is published of it."""
+"""Reproduced studies: specifications, claims, figures, and publication."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class StudyResults:
-    """What was found in the experiments of a study that were run."""
+    """Results of the experiments of a study that were run."""
 
     study: Study
     out: Path
@@ -34,7 +34,7 @@ class StudyResults:
 
 
 def read_study(study: Study, out: Path) -> StudyResults:
-    """Results of a study, by the last parts of its experiments' names."""
+    """Return the results of a study, by the last parts of its experiments' names."""
     found = {last_part(name): find_results(out, name) for name in study.configs}
     return StudyResults(study, out, {name: results for name, results in found.items() if results is not None})
 
@@ -57,7 +57,7 @@ class StudyList(Result):
         return pd.DataFrame(rows, columns=["experiment", "specification"])
 
     def sections(self) -> list[Section]:
-        """Return what each study is about, and the experiments of all."""
+        """Return the subject of each study, and the experiments of all."""
         titles = [f"- {each.name}: {each.title}" for each in self.studies]
         return [Section("", titles, self.to_frame(), notes=["Specifications are in configs."])]
 
@@ -71,7 +71,7 @@ class StudyFigure:
 
     @property
     def place(self) -> Path:
-        """Its file, relative to the results folder."""
+        """Path of its file, relative to the results folder."""
         return Path(f"{self.study.folder.name}_figures") / f"figure_{self.number}.svg"
 
     @property
@@ -81,7 +81,7 @@ class StudyFigure:
 
     @property
     def caption(self) -> str:
-        """What it shows."""
+        """Caption, the first line of its function's docstring."""
         return (self._draw.__doc__ or "").partition("\n")[0].rstrip(".")
 
     @property
@@ -90,13 +90,13 @@ class StudyFigure:
         return found
 
     def svg(self, out: Path) -> bytes:
-        """Draw it."""
+        """Draw the figure."""
         require_results([self], out)
         return bytes(self._draw(*(read_results(out, name) for name in self.experiments)))
 
 
 def sorted_names(names: Sequence[str], out: Path) -> tuple[list[str], list[str]]:
-    """Names of experiments with results, and all others: those of figures come first where both have a name."""
+    """Return names of experiments with results, and all others; a figure takes precedence over an experiment."""
     known = set(experiments_in(out)) - _named_figures().keys()
     own = [name for name in dict.fromkeys(names) if name in known]
     return own, [name for name in names if name not in known]
@@ -104,7 +104,7 @@ def sorted_names(names: Sequence[str], out: Path) -> tuple[list[str], list[str]]
 
 @cache
 def _named_figures() -> dict[str, list[StudyFigure]]:
-    """Return the figures by every name that they have: one or all of a study, and by number of the default study."""
+    """Return the figures by all their names: one or all of a study, and by number of the default study."""
     of_studies = {name: [StudyFigure(study, k) for k in study.figures] for name, study in all_studies().items()}
     named = {figure.number: [figure] for figure in of_studies[DEFAULT_STUDY]}
     for name, figures in of_studies.items():
@@ -113,7 +113,7 @@ def _named_figures() -> dict[str, list[StudyFigure]]:
 
 
 def find_figures(names: Sequence[str], out: Path | None = None) -> list[StudyFigure]:
-    """The figures that were asked for."""
+    """Return the requested figures."""
     named = _named_figures()
     for name in names:
         place, _, number = name.rpartition("/")

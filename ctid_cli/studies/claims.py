@@ -1,4 +1,4 @@
-"""Claims of a study: what must hold of its results, with the number that decides."""
+"""Claims of a study: conditions on its results, with the number that decides."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from ctid_cli.studies.catalogue import StudyResults
 
 @dataclass(frozen=True)
 class Claim:
-    """One thing that must hold; ``holds`` is None for what is only reported."""
+    """A condition on results; ``holds`` is None if it is only reported."""
 
     claim: str
     measured: str
     required: str = ""
     holds: bool | None = None
-    #: Experiments whose results decide, filled in where claims are collected.
+    #: Experiments whose results decide, set when claims are collected.
     experiment: str = ""
 
     @property
     def verdict(self) -> str:
-        """Return the last column of a table of claims."""
+        """Last column of a table of claims."""
         return {True: "yes", False: "NO", None: ""}[self.holds]
 
 
 def within(claim: str, value: float | None, low: float = -math.inf, high: float = math.inf, shown: str = "") -> Claim:
-    """Return the claim that a number lies in an interval; None stands for what never came."""
+    """Return the claim that a number lies in an interval; None means that it was never reached."""
     number = math.inf if value is None or math.isnan(value) else float(value)
     if math.isinf(low):
         required = f"at most {high:g}"
@@ -41,7 +41,7 @@ def within(claim: str, value: float | None, low: float = -math.inf, high: float 
 
 
 def near(claim: str, value: float | None, target: float, tolerance: float) -> Claim:
-    """Return the claim that a number lies around another one."""
+    """Return the claim that a number is within a tolerance of another."""
     return within(claim, value, target - tolerance, target + tolerance)
 
 
@@ -61,7 +61,7 @@ class CheckedClaims(Result):
 
     @property
     def counted(self) -> str:
-        """How many of the claims hold."""
+        """Number of claims that hold, in words."""
         tested = [claim.holds for claim in self.claims if claim.holds is not None]
         return f"{sum(tested)} of {len(tested)} hold"
 
@@ -80,7 +80,7 @@ class CheckedClaims(Result):
 
 
 def check_claims(found: StudyResults) -> CheckedClaims:
-    """Test all claims of a study on its results; an experiment that was not run is a claim that fails."""
+    """Test all claims of a study on its results; an experiment that was not run is a failed claim."""
     study = found.study
     missing = [short for short in map(last_part, study.configs) if short not in found]
     claims = [Claim("was run", "no", "yes", False, short) for short in missing]

@@ -1,8 +1,8 @@
-"""The estimates of the first data sets of a study, kept beside it: a reproduction small enough for every change.
+"""Committed estimates of the first data sets of a study: a reproduction small enough for every change.
 
-They are computed from the published specifications with fewer and shorter records, stored and read back as
-``ctid run`` would, and must agree with those that were committed: parameters within a fraction of their standard
-errors, so that the order in which a processor rounds does not matter.
+They are computed from the published specifications with fewer and shorter records, stored and read like those of ``ctid
+run``, and must agree with the committed ones: parameters within a fraction of their standard errors, so that the
+rounding of different processors does not matter.
 """
 
 import json
@@ -17,35 +17,35 @@ from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.plan import Plan
 from ctid_cli.written_files import write_file
 
-#: Largest difference of an estimated parameter [standard errors of it]. Newton's method ends where the squared error
-#: would fall by less than 1e-12 of itself: at most 1e-6 sqrt(N) standard errors from the optimum, 9e-5 for the 8,000
-#: samples of the longest record, from either side. Other iterations end nearer.
+#: Largest difference of an estimated parameter [its standard errors]. Newton's method ends if the squared error would
+#: decrease by less than 1e-12 of itself: at most 1e-6 sqrt(N) standard errors from the optimum, 9e-5 for the 8,000
+#: samples of the longest record, in either direction. Other iterations end closer to it.
 OF_ERROR = 2e-4
 #: Largest relative difference of a standard error, a cost or a fit: their sampling deviation is below a tenth of them,
-#: so that they change by less than a tenth of what the parameters do in standard errors.
+#: so they change by less than a tenth of what the parameters change in standard errors.
 RELATIVE = 2e-5
 #: Largest difference of a measure of a track, in its unit: rounding moves frequencies of exact signals by 4e-12 rad/s.
 OF_MEASURE = 1e-9
-#: Largest difference of the share of valid samples [%]: on exact signals rounding decides when a reading becomes valid,
-#: one sample in 3,300 earlier or later.
+#: Largest difference of the share of valid samples [%]: with exact signals rounding decides when a reading becomes
+#: valid, one sample in 3,300 earlier or later.
 OF_SHARE = 0.1
-#: What is compared of an estimate.
+#: Compared fields of an estimate.
 QUANTITIES = (
     *("start_delay", "delay", "numerator", "denominator", "parameters", "standard_errors", "cost", "fit_percent"),
     "measures",
 )
-#: Statuses of estimates that are compared number by number: those of frequencies follow from filters, valid or not.
+#: Statuses of estimates whose numbers are compared: frequencies come from filters, whether valid or not.
 COMPARED = ("CONVERGED", "VALID", "INVALID")
 
 Estimates = dict[str, dict[str, Any]]
 
 
-#: Where the committed estimates lie in the folder of a study.
+#: Path of the committed estimates in the folder of a study.
 FILE = "first_estimates.json"
 
 
 def compute_first(study: Study, out: Path, jobs: int | None = None) -> Estimates:
-    """Run the first data sets of a study, and read them back by experiment, settings, estimator and start."""
+    """Run the first data sets of a study, and return them by experiment, settings, estimator and start."""
     found: Estimates = {}
     for short, overrides in study.first.items():
         plan = study.plan(short, ["monte_carlo.runs=1", *overrides])
@@ -55,7 +55,7 @@ def compute_first(study: Study, out: Path, jobs: int | None = None) -> Estimates
             swept = [f"{name}={row[name]}" for name in plan.data_cells[0].swept]
             words = [short, *swept, row["estimator"], str(row.get("initial_delay")), str(row["replicate"])]
             compared = row["status"] in COMPARED or row["estimator"] in steps
-            # Of a sum of submodels numerator and denominator follow from the parameters.
+            # Numerator and denominator of a sum of submodels follow from the parameters.
             kept = [name for name in QUANTITIES if not (row.get("parameters") and name in ("numerator", "denominator"))]
             values = dict(_numbers({name: row.get(name) for name in kept})) if compared else {}
             found[" ".join(words)] = {"status": row["status"], "values": values}
@@ -63,7 +63,7 @@ def compute_first(study: Study, out: Path, jobs: int | None = None) -> Estimates
 
 
 def _single_steps(plan: Plan) -> set[str]:
-    """Estimators that take one step from where they start, which is compared whether it converged or not."""
+    """Return estimators that take a single step from their start, which is compared whether it converged or not."""
     return {cell.name for cell in plan.estimators if cell.content.get("max_iterations") == 1}
 
 
@@ -77,27 +77,27 @@ def _numbers(content: Any, name: str = "") -> Iterator[tuple[str, float]]:
 
 
 def read_first(study: Study) -> Estimates:
-    """The committed estimates of a study."""
+    """Return the committed estimates of a study."""
     return dict(json.loads((study.folder / FILE).read_text(encoding="utf-8")))
 
 
 def write_first(study: Study, found: Estimates) -> None:
-    """Commit to these estimates: one line for each, so that a change can be read."""
+    """Write estimates to be committed, one per line, for readable differences."""
     lines = [f"{json.dumps(name)}: {json.dumps(found[name])}" for name in found]
     write_file(study.folder / FILE, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
 
 
 class Comparison(NamedTuple):
-    """Recomputed estimates against the committed ones, in words."""
+    """Comparison of recomputed estimates with the committed ones, in words."""
 
-    #: What is not as it was committed.
+    #: Differences from the committed estimates.
     wrong: list[str]
     #: The largest difference of each kind of number.
     largest: list[str]
 
 
 def compare(found: Estimates, committed: Estimates) -> Comparison:
-    """Compare estimates with those that were committed."""
+    """Compare estimates with the committed ones."""
     wrong = [f"{name}: missing" for name in committed if name not in found]
     wrong += [f"{name}: not among those that were committed" for name in found if name not in committed]
     largest: dict[_Kind, tuple[float, str]] = {}
@@ -114,7 +114,7 @@ def compare(found: Estimates, committed: Estimates) -> Comparison:
                 continue
             kind, unit = _kind_of(key, theirs["values"])
             size = 0.0 if a == b else abs(a - b) / unit if unit else math.inf
-            # A difference that is not a number is no agreement.
+            # A difference of NaN counts as a disagreement.
             if not size <= kind.allowed:
                 outside.append((size / kind.allowed, f"{name}: {key} {a!r} (not {b!r}, {size:.2g} {kind.unit} away)"))
             if size > largest.get(kind, (0.0, ""))[0]:
@@ -126,7 +126,7 @@ def compare(found: Estimates, committed: Estimates) -> Comparison:
 
 
 class _Kind(NamedTuple):
-    """In what a difference is counted, and how much of it is allowed."""
+    """Unit of a difference, and its tolerance."""
 
     unit: str
     allowed: float
@@ -139,7 +139,7 @@ _OF_SHARE = _Kind("% of the samples", OF_SHARE)
 
 
 def _kind_of(key: str, values: Mapping[str, float]) -> tuple[_Kind, float]:
-    """How a number is compared, and the unit of its difference."""
+    """Return how a number is compared, and the unit of its difference."""
     group, _, name = key.partition(".")
     if group == "measures":
         return (_OF_SHARE if name == "valid_share" else _OF_MEASURE), 1.0

@@ -1,4 +1,4 @@
-"""What is published of a study: tables, figures, claims, and the environment that made them, from one commit."""
+"""Publication of a study: tables, figures, claims, and the environment that made them, from one commit."""
 
 import json
 import subprocess
@@ -18,14 +18,14 @@ from ctid_cli.written_files import write_file
 
 
 def commit_of(found: StudyResults) -> str:
-    """The commit of this repository that computed all results of a study; refuses any others."""
+    """Return the commit of this repository that computed all results of a study; refuse any others."""
     changed = _git("status", "--porcelain", "--", ".", ":(exclude)results/published")
     if changed:
         raise RefusedError(f"nothing is published from files that are not committed:\n{changed}")
     for short, results in found.experiments.items():
         if results.stored.mixed:
             raise RefusedError(f"{results.experiment} mixes results of different code versions or processors")
-        # Code that a specification names is looked for beside it.
+        # Code that a specification names is searched next to it.
         folder = found.study.config(short).parent
         present = current_version(build_plan(spec_from_canonical(results.settings, folder)))
         if not {origin.code_version for origin in results.stored.origins} <= {present}:
@@ -39,7 +39,7 @@ def commit_of(found: StudyResults) -> str:
 
 def _git(*arguments: str) -> str:
     root = DATA
-    # An installed package may lie in a folder of some other repository.
+    # An installed package may be in a folder of another repository.
     if not (root / ".git").exists():
         raise UsageError(f"results are published from a checkout of the repository, and {root} is none")
     try:
@@ -66,7 +66,7 @@ def published_texts(found: StudyResults) -> dict[str, str]:
 
 
 def publish(checked: CheckedClaims, out: Path) -> None:
-    """Write everything that is published of a study, in place of what was published before."""
+    """Write all published files of a study, replacing earlier ones."""
     found, target = checked.results, checked.results.study.published
     commit = commit_of(found)
     texts = published_texts(found)

@@ -1,4 +1,4 @@
-"""The page of a reproduced study: its question, claims, tables and figures, from its results or as published."""
+"""Page of a reproduced study: question, claims, tables and figures, from its results or as published."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,11 +20,11 @@ CLAIMS = "claims.md"
 
 
 def page_of(name: str, out: Path) -> tuple[str, Path]:
-    """Return the page of an experiment or a study, and where it usually goes."""
+    """Return the page of an experiment or a study, and its default path."""
     known, studies = experiments_in(out), all_studies()
     if name in known:
         results = read_results(out, name)
-        # The commands on a page that is sent to others name no folder of this machine.
+        # Pages are sent to others, so their commands name no folder of this machine.
         return experiment_page(results, Path(shown(str(out)))), results.folder / "report.html"
     if name in studies:
         return study_page(studies[name], out), out / f"{studies[name].folder.name}_report.html"
@@ -34,7 +34,7 @@ def page_of(name: str, out: Path) -> tuple[str, Path]:
 
 
 def study_page(study: Study, out: Path) -> str:
-    """Return the page as HTML: of the results in a folder where all experiments were run, else of what is published."""
+    """Return the page as HTML: from a results folder if all experiments were run there, else as published."""
     published = study.published
     own = set(study.configs) <= set(experiments_in(out))
     if own:
@@ -74,7 +74,7 @@ def _question(study: Study) -> Iterator[Section]:
 
 
 def _figures(study: Study, out: Path, published: Path, *, own: bool) -> Iterator[Section]:
-    """Return its figures as published, but for those that its own results have."""
+    """Yield its figures as published, or from its own results."""
     for number, needed in study.figures.items():
         file = published / "figures" / f"figure_{number}.svg"
         drawn = own and bool(needed)
@@ -87,7 +87,7 @@ def _figures(study: Study, out: Path, published: Path, *, own: bool) -> Iterator
 
 
 def _published_origin(published: Path) -> Iterator[str]:
-    """Return what made the published results, in sentences."""
+    """Yield the origin of the published results, in sentences."""
     environment = environment_of(published)
     if environment is None:
         return

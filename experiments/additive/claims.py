@@ -1,4 +1,4 @@
-"""What must hold of the study's results: theory for long records, and the claims of the paper."""
+"""Claims on the study's results: theory for long records, and the claims of the paper."""
 
 from collections.abc import Iterator
 
@@ -11,21 +11,21 @@ from ctid_cli.studies.claims import Claim, within
 
 from .measures import REFERENCE, errors_of, groups_of, is_misused, mse_ratio
 
-#: From so many samples on the limit for long records is expected to hold.
+#: Number of samples from which the limit for long records is expected to hold.
 LONG = 20_000
-#: Where N times the mean-square error lies, as a multiple of the limit: 300 runs know it to 8 %.
+#: Admitted N times the mean-square error over its limit: 300 runs determine it to 8 %.
 NEAR_THEORY = (0.75, 1.3)
-#: Largest bias in standard deviations of one estimate: 300 runs know it to 0.06.
+#: Largest bias in standard deviations of one estimate: 300 runs determine it to 0.06.
 BIAS = 0.2
-#: Percentage of all points that must lie there: so many points have some that do not, by chance.
+#: Percentage of all points that must lie within the limits: of so large a number, some exceed them by chance.
 SHARE = 97.0
-#: Points that are compared with theory: what they are, how their parameters end, and whether they decide.
+#: Points compared with theory: description, endings of their parameters' names, and whether they decide.
 POINTS = {
     "open-loop": (("points of the figure", "_b0", True), ("points of all parameters", "", False)),
     "closed-loop": (("points of the figure", "", True),),
 }
 #: Mean-square error of another estimator over that of the sum of submodels: experiment, estimator, parameter, band.
-#: Parameters where theory says less than a tenth are left out: a few hundred runs cannot tell.
+#: Parameters whose ratio by theory exceeds 1 by less than a tenth are left out: a few hundred runs cannot resolve it.
 RATIOS = {
     ("open-loop", "srivc", "g2_b0"): (1.1, 1.6),
     ("open-loop", "srivc", "g3_b0"): (1.05, 1.45),
@@ -33,7 +33,7 @@ RATIOS = {
     ("closed-loop", "clsrivc", "g2_a2"): (1.25, 2.0),
     ("closed-loop", "clsrivc", "g2_b0"): (1.05, 1.35),
 }
-#: Least percentage that converges: experiment, estimator, numbers of samples from and below, percentage.
+#: Least percentage that converges: experiment, estimator, lower and upper limit of the number of samples, percentage.
 CONVERGENCE = (
     ("open-loop", "additive", 0, np.inf, 100.0),
     ("open-loop", "srivc", 0, 7000, 95.0),
@@ -42,17 +42,17 @@ CONVERGENCE = (
     ("closed-loop", "clsrivc", 0, np.inf, 99.0),
     ("closed-loop", "srivc", 0, np.inf, 99.0),
 )
-#: Under coloured noise in closed loop: least bias of the direct estimator in standard deviations of one estimate, and
-#: largest one of the estimators with closed-loop instruments in standard errors of the mean.
+#: With coloured noise in closed loop: least bias of the direct estimator in standard deviations of one estimate, and
+#: largest bias of the estimators with closed-loop instruments in standard errors of the mean.
 BIASED, UNBIASED = 3.0, 3.3
-#: Coverage [%] that counts as right, and how many of all parameters may lie outside.
+#: Accepted coverage [%], and the number of parameters that may lie outside.
 COVERAGE, OUTSIDE = (93.0, 97.0), 1
-#: The simulated beam: error of the output over the noise, relative error of a frequency, and how many must do.
+#: Simulated beam: error of the output over the noise, relative error of a frequency, and the required percentage.
 NOISE_FLOOR, FREQUENCY, BEAM_SHARE, BEAM_ITERATIONS = 1.2, 1e-5, 90.0, 12
 
 
 def errors_are_those_of_theory(results: Results) -> Iterator[Claim]:
-    """N times the mean-square error against theory: of the parameters that the figure shows, and of all."""
+    """Test N times the mean-square error against theory, for the parameters of the figure and for all."""
     low, high = NEAR_THEORY
     errors = errors_of(results).query("samples >= @LONG").dropna(subset="ratio")
     for what, names, decides in POINTS[last_part(results.experiment)]:
@@ -68,7 +68,7 @@ def errors_are_those_of_theory(results: Results) -> Iterator[Claim]:
 
 
 def estimates_are_unbiased(results: Results) -> Iterator[Claim]:
-    """Biases where records are long."""
+    """Test biases for long records."""
     errors = errors_of(results).query("samples >= @LONG").dropna(subset="bias_per_deviation").reset_index(drop=True)
     if len(errors):
         biases = errors["bias_per_deviation"].abs()
@@ -83,7 +83,7 @@ def estimates_are_unbiased(results: Results) -> Iterator[Claim]:
 
 
 def submodels_have_the_least_errors(results: Results) -> Iterator[Claim]:
-    """How much larger the errors of other estimators are."""
+    """Compare the errors of other estimators with those of the sum of submodels."""
     errors = errors_of(results).query("samples >= @LONG")
     theory = errors.groupby(["estimator", "parameter"], sort=False)["theory"].first()
     for (estimator, parameter), own in theory.items():
@@ -101,7 +101,7 @@ def submodels_have_the_least_errors(results: Results) -> Iterator[Claim]:
 
 
 def estimates_converge(results: Results) -> Iterator[Claim]:
-    """How many estimates converged, at the number of samples where fewest did."""
+    """Test the percentage of converged estimates, at the number of samples where it is least."""
     every = groups_of(results)
     every = every.assign(lost=every["failed"] + every["not_converged"]).sort_values("samples", kind="stable")
     every["share"] = 100 * (1 - every["lost"] / every["runs"])
@@ -120,7 +120,7 @@ def estimates_converge(results: Results) -> Iterator[Claim]:
 
 
 def feedback_biases_direct_instruments(results: Results) -> Iterator[Claim]:
-    """Who is biased where feedback brings coloured noise into the input."""
+    """Test which estimators are biased if feedback brings coloured noise into the input."""
     for row in errors_of(results).dropna(subset=["bias_per_deviation", "bias_per_error"]).itertuples():
         measured = f"{row.bias_per_deviation:+.2f} deviations of one estimate"
         measured += f", {row.bias_per_error:+.1f} standard errors"
@@ -133,7 +133,7 @@ def feedback_biases_direct_instruments(results: Results) -> Iterator[Claim]:
 
 
 def beam_is_found(results: Results) -> Iterator[Claim]:
-    """Whether the simulated beam is found from the printed initial values."""
+    """Test whether the simulated beam is found from the printed initial values."""
     floor = NOISE_FLOOR * 10 ** (-float(results.settings["noise"]["snr_db"]) / 10)
     estimates = results.estimates
     reached = estimates[(1 - estimates["fit_percent"] / 100) ** 2 < floor]
@@ -152,19 +152,19 @@ def beam_is_found(results: Results) -> Iterator[Claim]:
 
 
 def _covered(results: Results) -> pd.Series:
-    """Coverage of every parameter [%], by estimator."""
+    """Return the coverage of every parameter [%], by estimator."""
     return errors_of(results).dropna(subset="coverage").set_index("estimator")["coverage"]
 
 
 def coverage_is_reported(results: Results) -> Iterator[Claim]:
-    """Coverage of 95 % intervals by estimator; it is judged over both experiments together."""
+    """Report the coverage of 95 % intervals by estimator; it is tested for both experiments together."""
     for estimator, percentages in _covered(results).groupby(level=0, sort=False):
         claim = f"coverage of 95 % intervals, {estimator}{' (misused)' if is_misused(results, estimator) else ''}"
         yield Claim(claim, f"{percentages.min():.1f} to {percentages.max():.1f} %")
 
 
 def intervals_cover(*experiments: Results) -> Iterator[Claim]:
-    """Coverage where the formula is the right one, over all experiments."""
+    """Test the coverage for the noise that the formula assumes, over all experiments."""
     found = pd.concat(
         [own for one in experiments for name, own in _covered(one).groupby(level=0) if not is_misused(one, name)]
     )

@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-#: Looks of up to four estimators, told apart by colour, marker and line.
+#: Styles of up to four estimators, which differ in colour, marker and line.
 LOOKS: tuple[dict[str, Any], ...] = (
     {"color": DARK, "marker": "o", "markerfacecolor": DARK, "linestyle": "-"},
     {"color": MARK, "marker": "s", "markerfacecolor": "none", "linestyle": "--"},
     {"color": MIDDLE, "marker": "^", "markerfacecolor": "none", "linestyle": "-."},
     {"color": "#3a7d34", "marker": "x", "linestyle": ":"},
 )
-#: Estimators of each experiment, and what they are called: those in open loop, and in closed loop.
+#: Estimators of each experiment and their labels: open loop, and closed loop.
 OPEN_LOOP = {"additive": "sum of four submodels", "srivc": "SRIVC, 8 poles and 6 zeros, factored"}
 CLOSED_LOOP = {
     "additive": "sum of two submodels, closed loop",
@@ -94,10 +94,10 @@ def figure_6() -> bytes:
 
 
 def empirical_response(record: Record, lowest: float, highest: float) -> tuple[Array, ComplexArray]:
-    r"""Frequency response as the quotient of windowed spectra, without a model.
+    r"""Return the frequency response as the quotient of windowed spectra, without a model.
 
-    The system does not repeat itself within the record, least of all from rest: the Hann window takes the ends of the
-    record out. The spectrum of the held input is that of its samples times ``(1 - exp(-jwh))/(jwh)``.
+    The record is not periodic, and begins at rest: the Hann window removes the effect of its ends. The spectrum of the
+    held input is that of its samples times ``(1 - exp(-jwh))/(jwh)``.
     """
     h = record.interval
     window = np.hanning(record.t.size)
@@ -117,7 +117,7 @@ class Response:
     """One curve."""
 
     label: str
-    #: Frequencies, in the unit of the figure, rising, shape (K,).
+    #: Frequencies, in the unit of the figure, increasing, shape (K,).
     frequencies: Array
     #: Response [output unit/input unit], shape (K,).
     values: ComplexArray
@@ -126,7 +126,7 @@ class Response:
 
 
 def response_svg(curves: Sequence[Response], title: str, unit: str, *, unwrap: bool = True) -> bytes:
-    """Magnitude and phase of frequency responses."""
+    """Draw magnitude and phase of frequency responses."""
 
     def draw(figure: Figure) -> None:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1.7, 1])
@@ -148,7 +148,7 @@ def response_svg(curves: Sequence[Response], title: str, unit: str, *, unwrap: b
 
 
 def _phase(values: ComplexArray, unwrap: bool) -> Array:
-    """Phase in degrees; where it jumps from one end of the range to the other, the curve is interrupted."""
+    """Return the phase in degrees; the curve is interrupted where it jumps from one end of the range to the other."""
     angle = np.angle(values)
     if unwrap:
         return np.asarray(np.rad2deg(np.unwrap(angle)))
@@ -157,7 +157,7 @@ def _phase(values: ComplexArray, unwrap: bool) -> Array:
 
 
 def dense_frequencies(model: AdditiveModel, lowest: float, highest: float) -> Array:
-    """Frequencies that show every resonance of a model, however narrow."""
+    """Return frequencies that resolve every resonance of a model, however narrow."""
     distances = np.geomspace(1e-6, 0.1, 60)
     around = np.concatenate([1 - distances, [1.0], 1 + distances])
     near = [submodel.natural_frequency * around for submodel in model.submodels]
@@ -169,12 +169,12 @@ def dense_frequencies(model: AdditiveModel, lowest: float, highest: float) -> Ar
 
 
 def symbol(parameter: str) -> str:
-    """A parameter of a submodel as a formula."""
+    """Return a parameter of a submodel as a formula."""
     return re.sub(r"^g(\d+)_([ab])(\d+)$", r"$\2_{\1,\3}$", parameter)
 
 
 def mse_svg(errors: pd.DataFrame, methods: Mapping[str, str], names: Sequence[str], columns: int, title: str) -> bytes:
-    """Mean-square errors over the number of samples, one panel for each parameter."""
+    """Draw mean-square errors over the number of samples, one panel for each parameter."""
     lines = -(-len(names) // columns)
 
     def draw(figure: Figure) -> None:
@@ -208,8 +208,8 @@ def mse_svg(errors: pd.DataFrame, methods: Mapping[str, str], names: Sequence[st
 
 
 def labelled(label: str, groups: pd.DataFrame) -> str:
-    """Return what an estimator is called, and how many of its estimates are not as they should be."""
-    # Every parameter of a group carries the same counts.
+    """Return the label of an estimator, with the number of its unsuccessful estimates."""
+    # Every parameter of a group has the same counts.
     sums = groups.drop_duplicates("group")[["runs", "failed", "not_converged", "valueless"]].sum()
     unfinished = sums["failed"] + sums["not_converged"]
     notes = [f"{unfinished} of {sums['runs']} not converged"] if unfinished else []

@@ -1,11 +1,11 @@
-"""What the tables and the claims of the study share: errors, their ratios, and which standard errors are misused.
+"""Common measures of the tables and the claims: errors, their ratios, and misused standard errors.
 
 Columns of errors
 -----------------
 - ``experiment``, ``estimator``, ``samples``; ``parameter`` and its ``true`` value; ``runs``, ``failed``,
   ``not_converged``; ``counted``: those with a value. Errors are in the unit of the parameter.
-- ``mse``; ``n_mse``: times the number of samples; ``theory``: what that approaches; ``ratio`` of the two with its
-  standard error ``ratio_error`` for so many data sets [-].
+- ``mse``; ``n_mse``: times the number of samples; ``theory``: its limit; ``ratio`` of the two with its
+  standard error ``ratio_error`` for the number of data sets [-].
 - ``bias``; ``deviation``, the standard deviation of one estimate; ``bias_per_deviation``; ``bias_per_error``: in
   standard errors of the mean, whether there is a bias at all.
 - ``with_error``: estimates with a standard error; ``covered``: those whose 95 % interval holds the true value;
@@ -26,16 +26,16 @@ from ctid_cli.reporting.measures import measure_frame
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.running.theory import long_record_variances
 
-#: The estimator that others are compared with.
+#: Estimator with which others are compared.
 REFERENCE = "additive"
 MEASURES = ("mse", "bias", "deviation", "coverage", "error_ratio")
-#: What tells the errors of one parameter in one data cell from others.
+#: Columns that identify the errors of one parameter in one data cell.
 GROUP = ["group", "parameter"]
 
 
 @cache
 def groups_of(results: Results) -> pd.DataFrame:
-    """Return estimator and number of samples of each group, and how many of its estimates went wrong."""
+    """Return estimator and number of samples of each group, and the number of its unsuccessful estimates."""
     cells, parts = results.manifest["data_cells"], results.manifest["estimators"]
     groups = results.groups.rename(columns={"estimator": "place"})
     groups["samples"] = [int(lookup(cells[k]["content"], "sampling.samples") or 0) for k in groups["cell"]]
@@ -82,14 +82,14 @@ def errors_of(results: Results) -> pd.DataFrame:
 def mse_ratio(results: Results, estimator: str, parameter: str, samples: Sequence[int]) -> tuple[Measured, int]:
     """Return the mean-square error of an estimator over that of the sum of submodels, and the data sets of both.
 
-    Both estimators see the same noise, so their errors go together, and the ratio is known better than either error.
-    Longer records begin with the shorter ones of the same data set, so that their errors go together too: a data set,
-    at all its lengths, is what the jackknife leaves out.
+    Both estimators see the same noise, so their errors are correlated, and the ratio is more accurate than either
+    error. Longer records begin with the shorter ones of the same data set, so these errors are correlated too: the
+    jackknife leaves out a data set at all its lengths.
     """
     errors = results.errors[results.errors["parameter"] == parameter]
     errors = errors.merge(groups_of(results)[["estimator", "samples"]], left_on="group", right_index=True)
     errors = errors[errors["samples"].isin(samples)]
-    # N times the squared error by data set, where all lengths of both estimators have one.
+    # N times the squared error by data set, if all lengths of both estimators have one.
     errors["square"] = errors["samples"] * errors["value"] ** 2
     squares = errors.pivot(index="replicate", columns=["estimator", "samples"], values="square")
     known = squares[[estimator, REFERENCE]].dropna()
@@ -106,13 +106,13 @@ def parameters(results: Results) -> list[str]:
 
 
 def is_misused(results: Results, estimator: str) -> bool:
-    """Return whether an estimator takes coloured noise for white."""
+    """Return whether an estimator assumes white noise although it is coloured."""
     settings = results.settings
     return bool(settings["noise"]["kind"] != "white" and settings["estimators"][estimator]["covariance"] == "white")
 
 
 def ratios(results: Results) -> pd.DataFrame:
-    """Return mean-square errors of other estimators over those of the sum of submodels, where theory knows both."""
+    """Return mean-square errors of other estimators over those of the sum of submodels, if theory gives both."""
     known = errors_of(results).dropna(subset="theory")
     reference = known[known["estimator"] == REFERENCE].set_index(["samples", "parameter"])["theory"]
     rows = []

@@ -1,4 +1,4 @@
-"""What is published of the study: all errors as numbers, and the tables that a reader wants to see."""
+"""Published tables of the study: all errors as numbers, and selected tables for readers."""
 
 from collections.abc import Iterable, Sequence
 from functools import partial
@@ -15,7 +15,7 @@ from ctid_cli.studies.catalogue import StudyResults
 
 from .measures import errors_of, groups_of, is_misused, ratios
 
-#: Numbers of samples that the text shows, of all that were run.
+#: Numbers of samples shown in the text, out of all.
 SIZES = 6
 #: Experiments on coverage.
 COVERING = ("coverage-open-loop", "coverage-closed-loop")
@@ -28,13 +28,13 @@ TITLES = {
 
 
 def coverage(results: Results) -> pd.DataFrame:
-    """Return how often 95 % intervals contain the truth."""
+    """Return the coverage of 95 % intervals."""
     misused = {name: "yes" if is_misused(results, name) else "no" for name in results.settings["estimators"]}
     return errors_of(results).assign(misused=lambda frame: frame["estimator"].map(misused))
 
 
 def unfinished(results: Results) -> pd.DataFrame:
-    """Return every estimate that failed or did not converge, with what makes it again."""
+    """Return every estimate that failed or did not converge, with the data to reproduce it."""
     samples = {cell["hash"]: cell["content"]["sampling"]["samples"] for cell in results.manifest["data_cells"]}
     estimates = results.estimates
     samples = estimates["cell"].map(samples)
@@ -42,7 +42,7 @@ def unfinished(results: Results) -> pd.DataFrame:
 
 
 def tables(found: StudyResults) -> list[Section]:
-    """Return the tables for people."""
+    """Return the tables for readers."""
     parts = []
     for name, title in TITLES.items():
         if name not in found:
@@ -64,13 +64,13 @@ def tables(found: StudyResults) -> list[Section]:
 
 
 def some(sizes: Iterable[int]) -> list[int]:
-    """Return a few numbers of samples, the least and the greatest among them."""
+    """Return a few numbers of samples, including the least and the greatest."""
     ordered = sorted(set(sizes))
     return [ordered[k] for k in np.unique(np.linspace(0, len(ordered) - 1, SIZES).round().astype(int))]
 
 
 def convergence_table(results: Results) -> pd.DataFrame:
-    """Return counts of estimates that are not as they should be; all that have a value count in the tables below."""
+    """Return counts of unsuccessful estimates; all estimates with a value count in the tables below."""
     titles = {"runs": "estimates", "not_converged": "not converged", "failed": "failed", "valueless": "without a value"}
     sums = groups_of(results).groupby("estimator", sort=False)[[*titles]].sum()
     return sums.rename(columns=titles).reset_index()
@@ -103,7 +103,7 @@ def ratio_tables(results: Results) -> list[pd.DataFrame]:
 
 
 def bias_table(results: Results) -> pd.DataFrame:
-    """Return biases, a line for each estimator."""
+    """Return biases, one line for each estimator."""
     errors = errors_of(results).fillna({"bias_per_deviation": 0.0, "bias_per_error": 0.0})
     pairs = zip(errors["bias_per_deviation"], errors["bias_per_error"], strict=True)
     return pivot(errors.assign(text=[f"{a:+.2f} ({b:+.1f})" for a, b in pairs]), ["estimator"], "parameter", ["text"])
@@ -124,7 +124,7 @@ def beam_table(results: Results) -> pd.DataFrame:
 
 
 def coverage_table(experiments: Sequence[Results]) -> pd.DataFrame:
-    """Return coverage with its interval, a line for each parameter."""
+    """Return coverage with its interval, one line for each parameter."""
     found = pd.concat([coverage(results) for results in experiments])
     ends = zip(found["low"], found["high"], strict=True)
     return pd.DataFrame(

@@ -1,4 +1,4 @@
-"""What must hold of the study's results."""
+"""Claims on the study's results."""
 
 from collections.abc import Iterator
 
@@ -7,24 +7,24 @@ from ctid_cli.studies.claims import Claim, within
 
 from .tables import coverage
 
-#: Coverage [%] that counts as right, and the largest under coloured noise of the formula for white noise.
+#: Accepted coverage [%], and the largest with coloured noise of the formula for white noise.
 BAND, MISUSED = (93.0, 97.0), 85.0
-#: The largest coverage [%] of a delay that is biased by much more than its standard error.
+#: Largest coverage [%] of a delay whose bias is much larger than its standard error.
 BIASED = 5.0
 
 
 def intervals_cover(results: Results) -> Iterator[Claim]:
-    """Intervals contain the truth as often as they say, by the formula that is meant for the noise."""
+    """Test that intervals have their nominal coverage, with the formula for the noise."""
     return _covered(results, "not misused", "coverage of {parameter} [%], {formula} formula", *BAND)
 
 
 def white_formula_is_misused(results: Results) -> Iterator[Claim]:
-    """Under coloured noise the formula for white noise covers too seldom."""
+    """Test that with coloured noise the formula for white noise has too low a coverage."""
     return _covered(results, "misused", "coverage of {parameter} [%], white formula misused", high=MISUSED)
 
 
 def held_samples_shorten_the_delay(results: Results) -> Iterator[Claim]:
-    """An input known by its samples only is held too long, which no interval covers."""
+    """Test that an input known only by its samples is held too long, which biases the delay beyond any interval."""
     claim = "coverage of the delay [%], input known by its samples"
     return _covered(results, "parameter == 'delay'", claim, high=BIASED)
 

@@ -1,4 +1,4 @@
-"""What is published of the study: how often the intervals of each row cover, by parameter and formula."""
+"""Published table of the study: coverage of the intervals of each row, by parameter and formula."""
 
 from functools import cache
 from typing import Any
@@ -15,7 +15,7 @@ from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.studies.catalogue import StudyResults
 
-#: Rows of the table by experiment: letter, and what the data are.
+#: Rows of the table by experiment: letter, and description of the data.
 ROWS = {
     "case1-regular": ("a", "case 1, regular"),
     "case1-irregular-exact": ("b", "case 1, irregular, exact input record"),
@@ -29,12 +29,12 @@ ROWS = {
 
 @cache
 def coverage(results: Results) -> pd.DataFrame:
-    """Return coverage, ratio of standard errors and bias: a line for each formula and parameter."""
+    """Return coverage, ratio of standard errors and bias: one line for each formula and parameter."""
     plan = build_plan(spec_from_canonical(dict(results.settings)))
     errors = results.errors.dropna(subset="value")
     formulas = {"white": errors}
     if plan.data_cells[0].source.noise.coloured:
-        # Coloured noise is what the sandwich is meant for; the estimator stores the white formula, misused here.
+        # The sandwich formula is for coloured noise; the estimator stores the formula for white noise, misused here.
         formulas = {"sandwich, t": _robust(plan, errors), **formulas}
     status = results.stored.column("status")
     lines = [
@@ -49,7 +49,7 @@ def coverage(results: Results) -> pd.DataFrame:
 
 
 def _measured(errors: pd.DataFrame) -> dict[str, Any]:
-    """Return what is measured of the errors of one parameter by one formula."""
+    """Return the measures of the errors of one parameter with one formula."""
     values, widths, reach = errors[["value", "standard_error", "quantile"]].to_numpy().T.copy()
     sample, mean_error = Sample(values, widths, quantiles=reach), float(np.nanmean(widths))
     percent, bias, deviation = (
@@ -70,7 +70,7 @@ def _measured(errors: pd.DataFrame) -> dict[str, Any]:
 
 
 def _robust(plan: Any, errors: pd.DataFrame) -> pd.DataFrame:
-    """Return the errors with standard errors for coloured noise, not stored, from the same fits, made again."""
+    """Return the errors with standard errors for coloured noise, which are not stored, from repeated fits."""
     (cell,), (estimator,) = plan.data_cells, plan.estimators
     parts = []
     for replicate, own in errors.groupby("replicate", sort=False):
@@ -81,7 +81,7 @@ def _robust(plan: Any, errors: pd.DataFrame) -> pd.DataFrame:
 
 
 def tables(found: StudyResults) -> list[Section]:
-    """Return all lines for people."""
+    """Return all lines for readers."""
     lines = pd.concat([coverage(found[name]) for name in ROWS if name in found])
     shown = pd.DataFrame({"row": lines["row"], "data": lines["row"].map(dict(ROWS.values()))})
     shown["formula"] = lines["formula"] + lines["misused"].map({True: " (misused)", False: ""})

@@ -1,4 +1,4 @@
-"""What becomes of the four experiments, A to D, if the formulas of the paper are taken as they are printed."""
+"""Results of the four experiments, A to D, with the formulas of the paper as printed."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -33,34 +33,34 @@ def table() -> pd.DataFrame:
 
 
 def rows() -> Iterator[list[str]]:
-    """Lines of the table."""
+    """Yield the lines of the table."""
     for part in (epsilon, start, sign, excitation, delay):
         yield from part()
 
 
 def options(name: str, estimator: str = "finite_time", **changes: Any) -> Any:
-    """An estimator with the tuning of one experiment, changed."""
+    """Return an estimator with the tuning of one experiment, changed."""
     plan = find_study("finite-time-frequency").plan(EXPERIMENTS[name][0])
     own = next(cell.estimator.options for cell in plan.estimators if cell.name == estimator)
     return replace(own, **changes)
 
 
 def tones(name: str, duration: float = 60.0) -> Array:
-    """The two sinusoids of a signal one by one, shape (N, 2)."""
+    """Return the two sinusoids of a signal, shape (N, 2)."""
     _, omega, phases = EXPERIMENTS[name]
     t = INTERVAL * np.arange(round(duration / INTERVAL))
     return np.sin(np.outer(t, omega) + phases)
 
 
 def settled(estimator: Any, name: str, samples: Array) -> str:
-    """Time until both errors are below 0.05 rad/s to stay [s]."""
+    """Return the time from which both errors stay below 0.05 rad/s [s]."""
     track = estimator.track(samples, INTERVAL)
     time = settle(track.t, np.abs(track.frequencies - EXPERIMENTS[name][1]).max(axis=1), 0.05)
     return f"{time:.3g}" if np.isfinite(time) else "never"
 
 
 def determinant_from_tones(parts: Array, omega: Array, lag: int, spacing: int) -> Array:
-    """Determinant of the stacked regressors by its closed form.
+    """Return the determinant of the stacked regressors in closed form.
 
     ``phi(t) = 2^n sum_i [c_i^(n-1) ... c_i 1] y_i(t - n h)``, hence
     ``det = 2^(n n) det[y_i(t - n h - j d)] prod_(i<j) (c_i - c_j)``.
@@ -74,14 +74,14 @@ def determinant_from_tones(parts: Array, omega: Array, lag: int, spacing: int) -
 
 
 def rms_determinant(name: str, h: float, d: float) -> float:
-    """Root mean square of the determinant of the mixed regression."""
+    """Return the root mean square of the determinant of the mixed regression."""
     delays = (round(h / INTERVAL), round(d / INTERVAL))
     determinant = determinant_from_tones(tones(name), np.array(EXPERIMENTS[name][1]), *delays)
     return float(np.sqrt(np.mean(determinant**2)))
 
 
 def epsilon() -> Iterator[list[str]]:
-    """The normalisation enters the determinant of n rows once, not in each row."""
+    """Show that the normalisation enters the determinant of n rows once, not in each row."""
     for name in EXPERIMENTS:
         tuning = options(name)
         square = rms_determinant(name, tuning.h, tuning.d) ** 2
@@ -94,7 +94,7 @@ def epsilon() -> Iterator[list[str]]:
 
 
 def start() -> Iterator[list[str]]:
-    """Delays that are filled with zeros put a transient into the estimate, which never leaves it."""
+    """Show that delays filled with zeros cause a transient of the estimate, which never decays."""
     for name in ("A", "B", "D"):
         samples = tones(name, 30.0 if name == "D" else 60.0).sum(axis=1)
         if name == "B":
@@ -104,7 +104,7 @@ def start() -> Iterator[list[str]]:
 
 
 def sign() -> Iterator[list[str]]:
-    """The regressand of n tones has the sign of that of one tone."""
+    """Show that the regressand of n tones has the sign of that of one tone."""
     h = options("A").h
     theta = theta_of(np.array(EXPERIMENTS["A"][1]), h)
     found = []
@@ -116,14 +116,14 @@ def sign() -> Iterator[list[str]]:
 
 
 def excitation() -> Iterator[list[str]]:
-    """The mixed regression can vanish although the tones are different."""
+    """Show that the mixed regression can vanish although the tones are different."""
     sizes = [number(rms_determinant("A", 0.1, d), 2) for d in (2.0 * np.pi, options("A").d)]
     what = "the mixed regression is always excited (proposition 3), experiment A"
     yield [what, "rms determinant with d = 2 pi s and d = 0.13 s", *sizes]
 
 
 def delay() -> Iterator[list[str]]:
-    """A delay that satisfies the printed condition is useless in noise; the paper's own delays do not satisfy it."""
+    """Show that a delay within the printed condition is useless in noise; the paper's own delays violate it."""
     samples = tones("A", 20.0).sum(axis=1)
     samples = samples + SIGMA * np.random.default_rng(0).standard_normal(samples.size)
     tracks = [options(tuning).track(samples, INTERVAL) for tuning in ("A", "C")]

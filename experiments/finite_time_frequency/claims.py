@@ -1,4 +1,4 @@
-"""What must hold of the study's results: the claims of the paper, and what is claimed beyond it."""
+"""Claims on the study's results: those of the paper, and further ones."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -12,13 +12,13 @@ from ctid_cli.studies.claims import Claim, near, within
 
 from .measures import READINGS, efficiency, followed, larger_error, recovery, residuals, settling
 
-#: Longest times to come back to 1e-6 rad/s after a step without noise [s].
+#: Longest times to return to 1e-6 rad/s after a step without noise [s].
 RECOVERY = {"window": 7.605, "restarting": 2.85, "restarting_prefiltered": 3.9}
 #: Largest root-mean-square error over the Cramer-Rao bound.
 EFFICIENT = {"restarting_prefiltered": 2.6, "restarting_total": 4.0, "esprit": 1.35, "nonlinear_least_squares": 1.35}
-#: From when to when [s] the finite-time estimate is exact, and how much it may be off.
+#: Interval [s] in which the finite-time estimate is exact, and its tolerance.
 EXACT = {"two-tones": (0.66, np.inf, 1e-8), "step": (3.6, 30.0, 1e-10)}
-#: When the gradient has settled within some bands [s]: by experiment, reading of the step and piece of the record.
+#: Settling times of the gradient in some bands [s]: by experiment, reading of the step and piece of the record.
 GRADIENT = (
     ("two-tones", "", "from 0 s", {0.05: 10.14, 0.01: 13.66, 1e-3: 19.57}),
     ("step", "jump", "from 0 s", {0.05: 6.34, 0.01: 8.26, 1e-3: 10.80}),
@@ -28,13 +28,13 @@ GRADIENT = (
 
 
 def one(rows: pd.DataFrame, **wanted: Any) -> pd.Series:
-    """Return the one row of these properties."""
+    """Return the only row with these properties."""
     (place,) = np.flatnonzero(np.logical_and.reduce([rows[name] == value for name, value in wanted.items()]))
     return rows.iloc[place]
 
 
 def finite_time_is_exact(results: Results) -> Iterator[Claim]:
-    """Finite time without noise: right from n(2h + d) on, and not valid before."""
+    """Test finite time without noise: exact from n(2h + d) on, and not valid before."""
     begin, until, limit = EXACT[last_part(results.experiment)]
     source, track = next(rest for common, *rest in followed(results) if "finite_time" in common)
     error = larger_error(source, track)
@@ -45,7 +45,7 @@ def finite_time_is_exact(results: Results) -> Iterator[Claim]:
 
 
 def gradient_settles(results: Results) -> Iterator[Claim]:
-    """Settling times of the gradient estimate."""
+    """Test the settling times of the gradient estimate."""
     for name, reading, piece, targets in GRADIENT:
         if name == last_part(results.experiment):
             row = one(settling(results), estimator="gradient", reading=reading, piece=piece)
@@ -55,7 +55,7 @@ def gradient_settles(results: Results) -> Iterator[Claim]:
 
 
 def disturbance_leaves_a_bias(harmonic: Results) -> Iterator[Claim]:
-    """A tone that the model does not have."""
+    """Test the bias from a tone that is not modelled."""
     for tone, target, tolerance in ((1, 0.0039, 0.0005), (2, -0.0232, 0.001)):
         bias = one(residuals(harmonic), estimator="finite_time", tone=tone)["bias"]
         yield near(f"finite time: mean error of w{tone}", bias, target, tolerance)
@@ -64,13 +64,13 @@ def disturbance_leaves_a_bias(harmonic: Results) -> Iterator[Claim]:
 
 
 def prefilter_removes_the_noise(random: Results) -> Iterator[Claim]:
-    """A tracker with a prefilter in noise."""
+    """Test a tracker with a prefilter in noise."""
     rms = residuals(random).query("estimator == 'restarting_prefiltered'")["rms"]
     yield within("restarting_prefiltered: median rms error", rms.max(), high=2e-4)
 
 
 def memory_ends(results: Results) -> Iterator[Claim]:
-    """After a step without noise, estimators whose memory ends are in finite time again."""
+    """Test that estimators with finite memory are in finite time again after a step without noise."""
     for row in recovery(results).query("estimator in @RECOVERY").itertuples():
         yield within(
             f"{row.estimator}, within {row.band:g}, {row.reading} [s]", row.longest, high=RECOVERY[row.estimator]
@@ -78,7 +78,7 @@ def memory_ends(results: Results) -> Iterator[Claim]:
 
 
 def steps_are_found_in_noise(results: Results) -> Iterator[Claim]:
-    """Steps in noise: how long, and no false alarm."""
+    """Test steps in noise: time to detection, and no false alarm."""
     for reading in READINGS:
         row = one(recovery(results), estimator="restarting_prefiltered", reading=reading)
         name = f"false alarms in {row['data_sets']} data sets, {reading}"
@@ -88,7 +88,7 @@ def steps_are_found_in_noise(results: Results) -> Iterator[Claim]:
 
 
 def errors_reach_the_bound(results: Results) -> Iterator[Claim]:
-    """Errors against the Cramer-Rao bound, and the bias of the finite-time estimate."""
+    """Test errors against the Cramer-Rao bound, and the bias of the finite-time estimate."""
     rows = efficiency(results)
     for estimator, ratio in rows.groupby("estimator")["ratio"].max()[[*EFFICIENT]].items():
         yield within(f"{estimator}: rms error / bound", ratio, high=EFFICIENT[estimator])
@@ -97,7 +97,7 @@ def errors_reach_the_bound(results: Results) -> Iterator[Claim]:
 
 
 def comparators_settle(two_tones: Results) -> Iterator[Claim]:
-    """The derived comparators against their own baseline."""
+    """Test the derived comparators against their own baseline."""
     for estimator, limit in (("observer", 30.0), ("filter", 20.0)):
         time = one(settling(two_tones), estimator=estimator)["within_0.001"]
         yield within(f"{estimator} within 0.001 [s]", time, high=limit)

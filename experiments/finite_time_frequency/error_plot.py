@@ -1,4 +1,4 @@
-"""Drawings of estimated frequencies over time, and of their errors on a logarithmic axis."""
+"""Figures of estimated frequencies over time, and of their errors on a logarithmic axis."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Looks of up to three estimators of a group, told apart by colour, lightness and dashes.
+#: Styles of up to three estimators of a group, which differ in colour, lightness and dashes.
 LOOKS: tuple[dict[str, Any], ...] = (
     {"color": DARK, "linestyle": "-"},
     {"color": MARK, "linestyle": (0, (3.2, 1.4))},
     {"color": MIDDLE, "linestyle": (0, (1, 1))},
 )
-#: What an estimate looks like that its estimator calls valid, and one that it calls invalid.
+#: Styles of estimates that are valid and invalid by their estimator.
 FIRM: dict[str, Any] = {"linewidth": 1.5}
 FAINT: dict[str, Any] = {"alpha": 0.6, "linewidth": 0.7}
-#: What the truth, and the error of an estimate from the whole record look like.
+#: Styles of the truth, and of the error of an estimate from the whole record.
 TRUTH: dict[str, Any] = {"color": LIGHT, "linewidth": 3.2, "alpha": 0.6, "solid_capstyle": "butt"}
 WHOLE: dict[str, Any] = {"color": MIDDLE, "linewidth": 0.8}
-#: Smaller errors than this are rounding, and drawn here [rad/s].
+#: Smaller errors are rounding, and drawn at this value [rad/s].
 ROUNDING = 1e-16
 
 
 class Curve(NamedTuple):
-    """Frequencies as one estimator found them."""
+    """Frequencies of one estimator."""
 
     label: str
     track: FrequencyTrack
@@ -41,26 +41,26 @@ class Curve(NamedTuple):
 
     @property
     def error(self) -> Array:
-        """Larger one of the errors of all tones, no smaller than rounding [rad/s], shape (N,)."""
+        """Largest error of all tones, at least the rounding [rad/s], shape (N,)."""
         return np.asarray(np.maximum(np.abs(self.track.frequencies - self.true).max(axis=1), ROUNDING))
 
 
 class Row(NamedTuple):
-    """The same experiment seen by all groups of estimators: a row of panels with frequencies, and one with errors."""
+    """One experiment for all groups of estimators: a row of panels with frequencies, and one with errors."""
 
     title: str
-    #: Estimators that share a column, by its title.
+    #: Estimators of each column, by its title.
     groups: Mapping[str, Sequence[Curve]]
     #: Length of the record [s].
     duration: float
-    #: From here on a finite-time estimator can be exact [s].
+    #: Time from which a finite-time estimator can be exact [s].
     exact_from: float
-    #: Error of an estimate from the whole record [rad/s]; None draws none.
+    #: Error of an estimate from the whole record [rad/s]; None for no line.
     reference: float | None = None
 
 
 def errors_svg(rows: Sequence[Row], frequencies: tuple[float, float], errors: tuple[float, float], title: str) -> bytes:
-    """Frequencies and errors over time."""
+    """Draw frequencies and errors over time."""
 
     def draw(figure: Figure) -> None:
         from matplotlib.lines import Line2D

@@ -1,8 +1,8 @@
 """Figures of the study: 1 to 4 of the paper, with errors and with more estimators.
 
 Signals and tuning are those of Vediakova, Vedyakov, Pyrkin, Bobtsov and Gromov, "Frequency estimation of
-multi-sinusoidal signals in finite-time" (2020). Two of its four estimators are not available in print: what stands in
-their place is derived, and every figure says so.
+multi-sinusoidal signals in finite-time" (2020). Two of its four estimators are not available in print: their
+replacements are derived, as every figure states.
 """
 
 from collections.abc import Mapping
@@ -18,9 +18,9 @@ from ctid_cli.specification.load import spec_from_canonical
 
 from .error_plot import Curve, Row, errors_svg
 
-#: What estimators are called that the paper compares with, but that are not theirs.
+#: Labels of replaced estimators of the paper.
 DERIVED = "derived, not the published algorithm"
-#: Columns of every figure: what the estimators have in common, and their labels by name in the specification.
+#: Columns of every figure: common property of the estimators, and their labels by name in the specification.
 GROUPS: Mapping[str, Mapping[str, str]] = {
     "the paper's estimators": {"finite_time": "finite time", "gradient": "gradient"},
     "finite time after every change": {
@@ -30,7 +30,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
     },
     DERIVED: {"observer": "adaptive observer", "filter": "filter regression", "filter_gradient": "the same, gradient"},
 }
-#: Rows of the drawn tracks are so far apart [s], finer than a line is wide.
+#: Interval between the rows of drawn tracks [s], finer than the width of a line.
 DRAWN_INTERVAL = 0.1
 
 
@@ -61,13 +61,13 @@ def figure_4(results: Results) -> bytes:
 
 
 def plan_of(results: Results) -> Plan:
-    """Return the plan of stored results; kinds that name files are seen from the folder of the specifications."""
+    """Return the plan of stored results; paths of kinds are relative to the folder of the specifications."""
     folder = data_folder("configs") / "finite_time_frequency"
     return build_plan(spec_from_canonical(dict(results.settings), folder))
 
 
 def _row(results: Results, title: str = "", *, reference: bool = False, **swept: str) -> Row:
-    """Tracks of the first data set, with the truth."""
+    """Return the tracks of the first data set, with the truth."""
     plan = plan_of(results)
     cell = next(cell for cell in plan.data_cells if cell.swept.items() >= swept.items())
     parts, source = {part.name: part for part in plan.estimators}, cell.source
@@ -84,7 +84,7 @@ def _row(results: Results, title: str = "", *, reference: bool = False, **swept:
 
 
 def track_of(cell: DataCell, replicate: int, part: EstimatorCell, interval: float) -> FrequencyTrack:
-    """Return the track of an estimator on a data set, its rows an interval [s] apart."""
+    """Return the track of an estimator on a data set, with rows at an interval [s]."""
     record = cell.dataset(replicate).record
     track = part.estimator.prepare(record).fit().track
     every = max(1, round(interval / record.interval))
@@ -92,7 +92,7 @@ def track_of(cell: DataCell, replicate: int, part: EstimatorCell, interval: floa
 
 
 def _whole_record_error(results: Results) -> float:
-    """Root-mean-square error of nonlinear least squares over all data sets, of the worse tone [rad/s]."""
+    """Return the RMS error of nonlinear least squares over all data sets, of the worse tone [rad/s]."""
     stored = results.stored
     measures = dict(zip(stored.export.parts("measures"), stored.column("measures").T, strict=True))
     own = stored.column("estimator") == b"nonlinear_least_squares"

@@ -1,4 +1,4 @@
-"""What the stored runs of the study say: settling times, recovery after a step, errors against the Cramer-Rao bound."""
+"""Measures of the stored runs: settling times, recovery after a step, errors against the Cramer-Rao bound."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -15,23 +15,23 @@ from .figures import DERIVED, GROUPS, plan_of, track_of
 
 #: Errors below which settling is measured [rad/s].
 BANDS = (0.05, 0.01, 1e-3)
-#: Rows of the tracks that settling is measured on are so far apart [s].
+#: Interval between the rows of the tracks on which settling is measured [s].
 TRACK_INTERVAL = 0.01
-#: Number of data sets of each data cell whose tracks are measured, by the experiments that have any.
+#: Number of data sets of each data cell whose tracks are measured, by experiment.
 TRACKED = {"two-tones": 1, "harmonic": 1, "random": 20, "step": 1}
 #: Readings of the step.
 READINGS = ("jump", "continuous")
-#: What tells the estimates of one estimator and reading of the step (empty if there is none) from others.
+#: Columns that identify the estimates of one estimator and reading of the step (empty if there is none).
 COMMON = ["experiment", "reading", "estimator", "derived"]
 
 
 def is_derived(estimator: str) -> bool:
-    """Return whether an estimator stands in for a published one whose equations are not in print."""
+    """Return whether an estimator replaces a published one whose equations are not in print."""
     return estimator in GROUPS[DERIVED]
 
 
 def estimates_of(results: Results) -> pd.DataFrame:
-    """Return what is common, and the measures, of each estimate that did not fail."""
+    """Return common columns and measures of each estimate that did not fail."""
     readings = [str(cell["swept"].get("phase_at_steps", "")) for cell in results.manifest["data_cells"]]
     frame, stored = results.estimates[["experiment", "estimator", "replicate"]], results.stored
     frame["cell"] = results.groups["cell"][results.numbers].to_numpy()
@@ -52,12 +52,12 @@ def by_tone(found: pd.DataFrame, *names: str) -> pd.DataFrame:
 
 
 def larger_error(source: SignalSource, track: FrequencyTrack) -> Array:
-    """Larger one of the errors of all tones [rad/s]."""
+    """Return the largest error of all tones [rad/s]."""
     return np.asarray(np.abs(track.frequencies - source.signal.frequencies_at(track.t)).max(axis=1))
 
 
 def settle(t: Array, error: Array, band: float, since: float = 0.0, until: float = np.inf) -> float:
-    """Time after `since` from which on the error stays below a band; infinite if it does not."""
+    """Return the time after `since` from which on the error stays below a band; infinite if it does not."""
     chosen = (t >= since - 1e-9) & (t < until - 1e-9)
     outside = np.flatnonzero(~(error[chosen] < band))
     if not outside.size:
@@ -66,7 +66,7 @@ def settle(t: Array, error: Array, band: float, since: float = 0.0, until: float
 
 
 def settling(results: Results) -> pd.DataFrame:
-    """Return settling times of the tracks, to the interval of their rows, before and after a step."""
+    """Return settling times of the tracks, with the resolution of their rows, before and after a step."""
     within = [f"within_{band:g}" for band in BANDS]
     times = pd.DataFrame(_settled(results), columns=[*COMMON, "piece", *within, "off"])
     pieces = times.groupby([*COMMON, "piece"], sort=False)
@@ -76,7 +76,7 @@ def settling(results: Results) -> pd.DataFrame:
 
 
 def _settled(results: Results) -> Iterator[tuple[object, ...]]:
-    """Yield the settling times of each piece of the first tracks, of estimators that give one estimate per sample."""
+    """Yield the settling times of each piece of the first tracks, for estimators with one estimate per sample."""
     for common, source, track in followed(results):
         error = larger_error(source, track)
         off = float((track.valid & (error > BANDS[0])).sum()) * float(track.t[1] - track.t[0])
@@ -87,7 +87,7 @@ def _settled(results: Results) -> Iterator[tuple[object, ...]]:
 
 
 def followed(results: Results) -> Iterator[tuple[tuple[str, ...], SignalSource, FrequencyTrack]]:
-    """Yield what is common, the signal and the track of the first data sets."""
+    """Yield the common columns, the signal and the track of the first data sets."""
     plan, runs = plan_of(results), TRACKED.get(results.experiment.rpartition("/")[2], 0)
     parts = {part.name: part for part in plan.estimators if not part.estimator.options.whole_record}
     rows = estimates_of(results)
@@ -105,7 +105,7 @@ def residuals(results: Results) -> pd.DataFrame:
 
 
 def recovery(results: Results) -> pd.DataFrame:
-    """Return times from the step until the errors of both tones are in the band to stay."""
+    """Return times from the step until the errors of both tones stay in the band."""
     found = estimates_of(results)
     late = found.filter(like="settling_after_step").fillna(np.inf).max(axis=1)
     groups = found.assign(late=late, never=np.isinf(late)).groupby(COMMON, sort=False)
@@ -117,7 +117,7 @@ def recovery(results: Results) -> pd.DataFrame:
 
 
 def efficiency(results: Results) -> pd.DataFrame:
-    """Return errors of the last estimates against the Cramer-Rao bound of Gaussian noise of the same variance."""
+    """Return errors of the last estimates against the Cramer-Rao bound for Gaussian noise of the same variance."""
     (cell,) = plan_of(results).data_cells
     source = cell.source
     truth = source.signal.frequencies_at(np.zeros(1))[0]
@@ -137,7 +137,7 @@ def efficiency(results: Results) -> pd.DataFrame:
 
 
 def cramer_rao(omega: Array, samples: int, interval: float, sigma: float) -> Array:
-    """Smallest standard deviations [rad/s] of the frequencies of ``sum sin(w t)`` in white Gaussian noise."""
+    """Return the least standard deviations [rad/s] of the frequencies of ``sum sin(w t)`` in white Gaussian noise."""
     t = interval * (np.arange(samples) - 0.5 * (samples - 1))[:, None]
     angle = t * omega
     J = np.hstack([t * np.cos(angle), np.cos(angle), np.sin(angle)])
@@ -145,6 +145,6 @@ def cramer_rao(omega: Array, samples: int, interval: float, sigma: float) -> Arr
 
 
 def monte_carlo_error(errors: Array) -> float:
-    """Standard deviation of a root mean square of independent errors."""
+    """Return the standard deviation of a root mean square of independent errors."""
     squares = errors**2
     return float(np.std(squares, ddof=1) / np.sqrt(squares.size) / (2.0 * np.sqrt(np.mean(squares))))

@@ -1,4 +1,4 @@
-"""What is published of the study: everything that was measured as numbers, and the tables for a reader."""
+"""Published tables of the study: all measures as numbers, and tables for readers."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -30,7 +30,7 @@ FORMATS = {
 
 
 def tables(found: StudyResults) -> list[Section]:
-    """Return the tables for people."""
+    """Return the tables for readers."""
     said = "`observer`, `filter` and `filter_gradient` are derived, not the published algorithms: the equations of the "
     said += "two comparators of the paper were not to be had. Frequencies and errors in rad/s, times in s."
     parts = [Section(sentences=[said])]
@@ -43,17 +43,17 @@ def tables(found: StudyResults) -> list[Section]:
 
 
 def named(estimator: str) -> str:
-    """Return an estimator as the tables show it."""
+    """Return the label of an estimator in the tables."""
     return f"`{estimator}`, {DERIVED}" if is_derived(estimator) else f"`{estimator}`"
 
 
 def times(values: pd.Series, digits: int = 2) -> pd.Series:
-    """Return times [s] as text, or that they never came."""
+    """Return times [s] as text; infinite ones in words."""
     return values.map(f"{{:.{digits}f}}".format).mask(values.isna(), "never")
 
 
 def across(rows: pd.DataFrame, key: str, order: Sequence[object], columns: Sequence[str], title: str) -> pd.DataFrame:
-    """Return some columns for each value of a key, by estimator, those that are derived behind the others."""
+    """Return some columns for each value of a key, by estimator, derived ones last."""
     wide = rows.pivot(index="estimator", columns=key, values=list(columns))
     found = wide[[(column, value) for value in order for column in columns]]
     derived = rows.drop_duplicates("estimator").sort_values("derived", kind="stable")["estimator"]
@@ -89,7 +89,7 @@ def paper_tables(results: Results) -> list[Section]:
 
 
 def recovery_table(results: Results) -> Section:
-    """Return how soon the frequencies are right again after a step without noise."""
+    """Return recovery times of the frequencies after a step without noise."""
     rows = recovery(results)
     rows["median"] = times(rows["median"], 3)
     table = across(rows, "reading", READINGS, ["median"], "{0} [s]").rename(index=named).reset_index()
@@ -98,7 +98,7 @@ def recovery_table(results: Results) -> Section:
 
 
 def noisy_recovery_table(results: Results) -> Section:
-    """Return how soon the frequencies are right again after a step in noise."""
+    """Return recovery times of the frequencies after a step in noise."""
     rows = recovery(results)
     said = (
         f"White Gaussian noise of standard deviation 0.11547, {rows['data_sets'].max()} data sets for each reading. "
@@ -114,7 +114,7 @@ def noisy_recovery_table(results: Results) -> Section:
 
 
 def efficiency_table(results: Results) -> Section:
-    """Return errors over the Cramer-Rao bound, and the bias that is a part of them."""
+    """Return errors over the Cramer-Rao bound, including the bias."""
     rows = efficiency(results)
     bounds = " and ".join(number(bound, 3) for bound in rows.drop_duplicates("tone")["bound"])
     said = (

@@ -1,4 +1,4 @@
-"""What must hold of the study's results."""
+"""Claims on the study's results."""
 
 from collections.abc import Iterator
 
@@ -10,13 +10,13 @@ from ctid_cli.reporting.study import find_study
 from ctid_cli.reporting.study_table import study_frame
 from ctid_cli.studies.claims import Claim, within
 
-#: Methods that must find the delay nearly always, wherever they start, and in how many of 100 data sets [%].
+#: Methods that must find the delay nearly always, from any start, and in how many of 100 data sets [%].
 RELIABLE = ("redundancy", "delay_profile")
 ALWAYS = 99.0
 
 
 def reaches_the_paper(results: Results) -> Iterator[Claim]:
-    """Ours converges as often as the published method was published to, in every cell."""
+    """Test that our method converges as often as the published one, in every cell."""
     study, found = find_study(), {results.experiment: results}
     rows = pd.concat([study_frame(study, table, found) for table in study.tables.values()], ignore_index=True)
     against = compare(rows[rows["experiment"] == results.experiment], None, study).decisive
@@ -28,7 +28,7 @@ def reaches_the_paper(results: Results) -> Iterator[Claim]:
 
 
 def always_converges(results: Results) -> Iterator[Claim]:
-    """The methods with redundant filters and those without an initial delay converge from everywhere."""
+    """Test that methods with redundant filters, or without an initial delay, converge from everywhere."""
     estimates = results.estimates
     for name in RELIABLE:
         judged = estimates.loc[estimates["estimator"] == name, "converged"]

@@ -1,7 +1,7 @@
 """Figures 1 to 7 of the study.
 
-Figures 1 and 2 are theory; 3 to 7 are computed from the specifications of cases 1 and 2: of each the first data set on
-which our search from 0 s switches the filter is made anew from its seed. Equation numbers are those of Ha, Welsh and
+Figures 1 and 2 are theory; 3 to 7 are computed from the specifications of cases 1 and 2, with the first data set on
+which our search from 0 s switches the filter, made again from its seed. Equation numbers are those of Ha, Welsh and
 Alamir, "Useful redundancy in parameter and time delay estimation for continuous-time models" (arXiv:1703.09344).
 """
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: SNR of the data sets that are drawn [dB].
+#: SNR of the drawn data sets [dB].
 SNR = 15.0
 #: Largest delay of the searches [s].
 LARGEST = 15.0
@@ -41,7 +41,7 @@ class Case:
 
     number: int
     experiment: str
-    #: Distance of the delays at which costs are drawn [s].
+    #: Distance of the delays at which costs are computed [s].
     interval: float
     #: Delays [s] that are drawn again in detail.
     detail: tuple[float, float]
@@ -119,7 +119,7 @@ def figure_2() -> bytes:
 
 
 def _draw_costs(axes: Any, filters: FilterSet, path: list[tuple[int, float]]) -> None:
-    """Ideal costs with the minimum path on them."""
+    """Draw ideal costs with the minimum path."""
     shown, lines = 5.25, ramp(filters.count)
     errors = np.linspace(0.0, shown, 1001)
     for k, cutoff in enumerate(filters.cutoffs):
@@ -141,7 +141,7 @@ def _draw_costs(axes: Any, filters: FilterSet, path: list[tuple[int, float]]) ->
 
 
 def _draw_intervals(axes: Any, check: FilterCheck, count: int) -> None:
-    """Which filter serves which delay error, and where none does."""
+    """Draw which filter serves each delay error, and gaps without one."""
     for color, label, most in ((BAND, "leads closer to zero", None), (LIGHT, "leads closest", 1)):
         for k in range(count):
             spans = [(item.low, item.high) for item in check.intervals if k in item.filters[:most]]
@@ -154,7 +154,7 @@ def _draw_intervals(axes: Any, check: FilterCheck, count: int) -> None:
 
 
 def _joined(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Intervals, those that adjoin made one."""
+    """Return intervals with adjoining ones joined."""
     joined: list[tuple[float, float]] = []
     for low, high in spans:
         if joined and joined[-1][1] == low:
@@ -204,7 +204,7 @@ def _computed(case: Case, noise: bool) -> Landscape:
 
 
 def published_search(case: Case, noise: bool) -> tuple[UsefulRedundancy, DataSet]:
-    """Our search of a case, or the printed one without noise, and the first data set on which ours switches."""
+    """Return our search of a case, or the printed one without noise, and the first data set on which ours switches."""
     plan = find_study("useful-redundancy").plan(case.experiment)
     ours = next(cell.estimator for cell in plan.estimators if cell.name == "redundancy")
     drawn = next(cell for cell in plan.data_cells if cell.swept["snr_db"] == SNR)

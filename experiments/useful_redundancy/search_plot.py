@@ -1,4 +1,4 @@
-"""A search by useful redundancy: the costs of its filters over the delay, its way through them, drawings of both."""
+"""Figures of a search by useful redundancy: costs of its filters over the delay, and its path."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: How often the delays are gone through, up and down in turn: more does not lower the costs visibly.
+#: Number of passes over the delays, alternately up and down: more do not lower the costs visibly.
 SWEEPS = 2
 
 
@@ -40,9 +40,9 @@ class Leg:
 class Landscape:
     """Costs over the delay and a search through them."""
 
-    #: Delays [s], rising, shape (N,).
+    #: Delays [s], increasing, shape (N,).
     delays: Array
-    #: Least costs over the coefficients that were found [%], of the filter of longest period first, shape (N, filters).
+    #: Least costs found over the coefficients [%], from the filter of longest period, shape (N, filters).
     members: Array
     #: J0 as the search evaluates it [%], shape (N,).
     evaluated: Array
@@ -66,11 +66,11 @@ class Landscape:
 def landscape(
     estimator: UsefulRedundancy, data_set: DataSet, delays: ArrayLike, initial_delay: float, sweeps: int = SWEEPS
 ) -> Landscape:
-    """Costs over the delay, and the search from one initial delay.
+    """Return the costs over the delay, and the search from one initial delay.
 
-    Far from the true delay the costs have local minima over the coefficients, and which one the search ends in changes
-    from delay to delay. The least costs come from a continuation: coefficients that are good at one delay and for one
-    filter are tried at the next one and for its neighbours.
+    Far from the true delay the costs have local minima over the coefficients, and the one found by the search varies
+    with the delay. The least costs come from a continuation: good coefficients at one delay and for one filter are
+    tried at the next delay and for its neighbours.
     """
     grid = np.asarray(delays, dtype=float)
     prepared = estimator.prepare(data_set.record)
@@ -94,12 +94,12 @@ def _least_costs(costs: Sequence[FilteredCost], delays: Array, sweeps: int) -> A
     for sweep in range(sweeps):
         before = None
         for i in range(delays.size) if sweep % 2 == 0 else reversed(range(delays.size)):
-            # What was found at the delay before and for the neighbouring filters, the widest band first.
+            # Coefficients at the previous delay and for the neighbouring filters, the widest band first.
             for k in reversed(range(many)):
                 known = [] if before is None else [(before, k)]
                 known += [(i, near) for near in (k + 1, k - 1) if 0 <= near < many]
                 starts = np.array([thetas[place] for place in known if np.isfinite(least[place])]).reshape(-1, size)
-                # Least squares on a narrow band is hopeless in noise.
+                # Least squares on a narrow band is unusable in noise.
                 own = sweep == 0 and (k == many - 1 or not starts.size)
                 found = costs[k].minimise(float(delays[i]), starts, own)
                 if found.squared_error < least[i, k]:
@@ -113,7 +113,7 @@ def _legs(reference_cost: Callable[[float], float], fit: RedundantFit) -> tuple[
     legs = []
     for visit in fit.search.trajectory[1:]:
         followed = [path for path in fit.paths if (path.round, path.filter) == (visit.round, visit.path)]
-        # The candidates of our search lie on a lattice, the ends of its paths do not.
+        # The candidates of our search lie on a lattice, unlike the ends of its paths.
         path = min(followed, key=lambda path: abs(path.delays[-1] - visit.point))
         delays = np.append(path.delays[:-1], visit.point)
         costs = np.array([reference_cost(delay) for delay in delays.tolist()])
@@ -122,7 +122,7 @@ def _legs(reference_cost: Callable[[float], float], fit: RedundantFit) -> tuple[
 
 
 def costs_svg(result: Landscape, title: str) -> bytes:
-    """Costs of all filters over the delay."""
+    """Draw the costs of all filters over the delay."""
     delays, members = result.delays, result.members
     lines = ramp(members.shape[1])
     top = 1.03 * float(members.max())
@@ -146,7 +146,7 @@ def costs_svg(result: Landscape, title: str) -> bytes:
 
 
 def trajectory_svg(result: Landscape, title: str, detail: tuple[float, float]) -> bytes:
-    """J0 over the delay, and the way of the delay estimate with the filters that it used."""
+    """Draw J0 over the delay, and the path of the delay estimate with the filters that it used."""
     whole = (float(result.delays[0]) - 0.2, float(result.delays[-1]))
 
     def draw(figure: Figure) -> None:
@@ -196,7 +196,7 @@ def _draw_filters(axes: Any, result: Landscape) -> None:
     count = result.members.shape[1]
     label: str | None = "end of a path not taken"
     for path in result.fit.paths:
-        # Nothing came of the last round, or nothing that is not on the way.
+        # The last round, which led to nothing, and the accepted paths are left out.
         if path.round <= len(result.legs) and not any(path.delays is leg.delays for leg in result.legs):
             axes.plot(path.delays, np.full(path.delays.size, path.filter + 1.0), "-", color=LIGHT, linewidth=0.7)
             axes.plot(path.delays[-1:], [path.filter + 1.0], "|", color=MIDDLE, markersize=5, label=label)
@@ -213,7 +213,7 @@ def _draw_filters(axes: Any, result: Landscape) -> None:
 
 
 def _draw_marks(axes: Any, result: Landscape, heights: Sequence[Array], named: bool = True) -> None:
-    """Start and end of the way, and a star where it leaves one filter for another."""
+    """Draw start and end of the path, and a star where it switches the filter."""
     first, last = result.legs[0], result.legs[-1]
     leaving = zip(result.legs[1:], heights, strict=False)
     stars = [(leg.delays[0], before[-1]) for leg, before in leaving if leg.switched]

@@ -1,4 +1,4 @@
-"""What is published of the study: its four tables, data sets on which a method failed, and how the searches went."""
+"""Published tables of the study: its four tables, failed data sets, and statistics of the searches."""
 
 import pandas as pd
 
@@ -9,17 +9,17 @@ from ctid_cli.reporting.study import last_part
 from ctid_cli.reporting.study_table import build_tables
 from ctid_cli.studies.catalogue import StudyResults
 
-#: Methods whose failures are not listed one by one: from most initial delays this one is meant to fail.
+#: Methods whose failures are not listed, because they fail from most initial delays by design.
 UNLISTED = ("existing",)
 
-#: What stands above the table of the searches.
+#: Text above the table of the searches.
 SEARCHES = """\
 How the searches went: estimates within 1 % of the true delay, and how many of the searches ended there before they were
 refined on unfiltered data; searches that switched the filter at least once, and the most switches of one."""
 
 
 def markdown(found: StudyResults) -> list[Section]:
-    """Return the tables for people."""
+    """Return the tables for readers."""
     return build_tables([], found.out).sections()
 
 
@@ -29,21 +29,21 @@ def cells(found: StudyResults) -> str:
 
 
 def failures(results: Results) -> pd.DataFrame:
-    """Return estimates that did not meet the success rule, each with what is needed to make it again."""
+    """Return estimates that did not meet the success rule, with the data to reproduce them."""
     estimates = _with_settings(results)
     estimates = estimates[(estimates["converged"] == False) & ~estimates["method"].isin(UNLISTED)]  # noqa: E712
     return estimates.assign(sampling=results.sampling, seed=results.manifest["seed"])
 
 
 def _with_settings(results: Results) -> pd.DataFrame:
-    """Return the estimates with the settings that are columns of tables whether they are swept or not."""
+    """Return the estimates with the settings that are columns of tables, swept or not."""
     estimates = results.estimates.rename(columns={"estimator": "method"})
     constant = {name: lookup(results.settings, path) for name, path in ALWAYS.items() if name not in estimates}
     return estimates.assign(**constant)
 
 
 def searches(results: Results) -> pd.DataFrame:
-    """Return the share of successes of each estimator and SNR, before refinement too, and its switches."""
+    """Return the share of successes of each estimator and SNR, also before refinement, and its switches."""
     within = lookup(results.settings, "success.delay_relative_error")
     estimates = _with_settings(results)
     estimates["max_delay_step"] = estimates.get("max_delay_step")
@@ -61,7 +61,7 @@ def searches(results: Results) -> pd.DataFrame:
 
 
 def searches_table(found: StudyResults) -> list[Section]:
-    """Return the same for people."""
+    """Return the share of successes for readers."""
     rows = pd.concat([searches(results) for results in found.experiments.values()], ignore_index=True)
     searched = rows["search_percent"].notna()
     shown = pd.DataFrame({"experiment": rows["experiment"].map(last_part), "SNR": rows["snr_db"].map("{:g} dB".format)})

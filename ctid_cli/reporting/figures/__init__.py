@@ -1,1 +1,1 @@
-"""Figures of published studies, computed from their specifications: one module per study, found by name."""
+"""Figures of experiments: box plots, and measures over the settings that vary."""

@@ -1,4 +1,4 @@
-"""Box plots of the errors of every parameter, by what an experiment varies."""
+"""Box plots of the errors of every parameter, by the settings that an experiment varies."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: More boxes than these in a panel need the whole width.
+#: A panel with more boxes takes the whole width.
 CROWDED = 16
-#: A panel reaches to this many times the median whisker: far errors are counted at its edge, not drawn.
+#: A panel ends at this many times the median whisker: larger errors are counted at its edge, not drawn.
 REACH = 3.0
 
 
@@ -59,7 +59,7 @@ def box_drawing(results: Results, asked: Sequence[str] = ()) -> Drawing:
 
 
 def _draw_panel(axes: Axes, rows: pd.DataFrame, settings: Settings) -> None:
-    """Draw the boxes of one parameter; what lies far outside most boxes is counted at the edge."""
+    """Draw the boxes of one parameter; errors outside the panel are counted at the edge."""
     width, middle = 0.7 / len(settings.methods), 0.5 * (len(settings.methods) - 1)
     boxes: list[tuple[float, int, Any]] = [
         (float(str(place)) + width * (k - middle), k, own["value"].to_numpy())
@@ -84,9 +84,9 @@ def _draw_panel(axes: Axes, rows: pd.DataFrame, settings: Settings) -> None:
 
 
 def _limits(groups: Sequence[Array]) -> tuple[float, float]:
-    """Return the range of a panel: all errors, as far as they are not much larger than the whiskers of most boxes."""
+    """Return the range of a panel: all errors that are not much larger than the whiskers of most boxes."""
     ends = [float(np.abs(np.quantile(errors, (0.05, 0.95))).max()) for errors in groups]
-    # Of two boxes the shorter one decides.
+    # With two boxes the shorter one decides.
     reach = REACH * float(np.quantile(ends, 0.5, method="lower"))
     every = np.concatenate(groups)
     low, high = max(float(every.min()), -reach), min(float(every.max()), reach)

@@ -1,4 +1,4 @@
-"""The figures that the results of any experiment can be drawn as."""
+"""Kinds of figures of the results of any experiment."""
 
 from collections.abc import Sequence
 from typing import Literal, get_args
@@ -14,7 +14,7 @@ Kind = Literal["measure", "box"]
 
 
 def kinds_of(results: Results) -> list[Kind]:
-    """The figures that an experiment has, the most telling one first."""
+    """Return the figures that an experiment has, the most informative one first."""
     if not len(results.stored):
         raise UsageError(f"{results.experiment} has no stored estimates yet; run it first")
     if results.settings.get("data") is not None:
@@ -28,16 +28,16 @@ def kinds_of(results: Results) -> list[Kind]:
 
 
 def main_measure(results: Results) -> str:
-    """What is measured where nothing is said: what the specification asks for, its rule of success, or the errors."""
+    """Return the default measure: that of the specification, its rule of success, or the errors."""
     asked = asked_measures(results)
     if not asked and results.settings.get("success"):
         return "percent"
-    # The last one of bias and root mean square error tells more.
+    # The root mean square error, the last one, is more informative than the bias.
     return next(reversed(default_measures(results) if not asked else asked[:1]), "cpu")
 
 
 def chosen_kind(results: Results, kind: str | None = None, measure: str | None = None) -> Kind:
-    """The kind of figure that was asked for, or the most telling one."""
+    """Return the requested kind of figure, or the most informative one."""
     known = kinds_of(results)
     if kind is None:
         return "measure" if measure is not None else known[0]
@@ -50,7 +50,7 @@ def chosen_kind(results: Results, kind: str | None = None, measure: str | None =
 def experiment_drawing(
     results: Results, kind: str | None = None, measure: str | None = None, parameters: Sequence[str] = ()
 ) -> Drawing:
-    """A figure of an experiment."""
+    """Return a figure of an experiment."""
     chosen = chosen_kind(results, kind, measure)
     if chosen == "measure":
         if parameters:

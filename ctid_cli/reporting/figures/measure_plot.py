@@ -1,7 +1,7 @@
-"""A measure over what an experiment varies.
+"""Figure of a measure over the settings that an experiment varies.
 
 Over several settings at once it is a nested loop plot: all combinations side by side, the last setting varying fastest,
-with stairs below that say which is which (G. Rücker and G. Schwarzer, Presenting simulation results in a nested loop
+with steps below that show the settings (G. Rücker and G. Schwarzer, Presenting simulation results in a nested loop
 plot, BMC Medical Research Methodology 14 (2014) 129). Bars and bands are 95 % intervals of the Monte Carlo error.
 """
 
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: What a measure of a good estimator is.
+#: Ideal value of each measure.
 IDEAL = {"bias": 0.0, "median_bias": 0.0, "coverage": 95.0, "error_ratio": 1.0, "efficiency": 100.0}
-#: Panels at most.
+#: Most panels.
 PANELS = 12
-#: Heights of a panel of a nested loop plot, and of a flight of its stairs [inch].
+#: Heights of a panel of a nested loop plot, and of the steps of one setting [inch].
 NESTED, FLIGHT = 1.9, 0.42
-#: An axis is logarithmic where positive values span so much.
+#: An axis is logarithmic if positive values span this factor.
 SPAN = 8.0
-#: Stretches of the stairs that are labelled.
+#: Most segments of the steps that are labelled.
 LABELLED = 24
 
 
 def measure_drawing(results: Results, measure: str) -> Drawing:
-    """Return a measure over what an experiment varies, one panel for each parameter."""
+    """Return a measure over the settings that an experiment varies, one panel for each parameter."""
     frame = measure_frame(results, [measure])
     frame = frame[frame["n"] > 0]
     settings, rows = placed(frame, results)
@@ -45,7 +45,7 @@ def measure_drawing(results: Results, measure: str) -> Drawing:
 
     def draw(figure: Figure) -> None:
         if flights:
-            # One below the other, above the stairs that all of them share.
+            # One below the other, above the common steps of the settings.
             heights = [*[NESTED] * len(names), FLIGHT * flights]
             column = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
             panels = list(column[:-1])
@@ -74,7 +74,7 @@ def _draw_panel(axes: Axes, rows: pd.DataFrame, settings: Settings, scale: Scale
         own = rows[rows["method"] == method].set_index("place").reindex(range(len(settings.points)))
         value, low, high = own[["value", "low", "high"]].to_numpy(dtype=float).T
         places, style = np.array(scale.shifted(k, len(settings.methods))), look(k)
-        # An interval without an end is not known; the value is drawn without a bar.
+        # A value whose interval is not known is drawn without a bar.
         known = np.isfinite(value) & np.isfinite(low) & np.isfinite(high)
         bars = np.abs(np.array([value - low, high - value]))[:, known]
         axes.errorbar(places[known], value[known], bars, fmt="none", ecolor=style["color"], elinewidth=0.9, capsize=1.8)
@@ -84,12 +84,12 @@ def _draw_panel(axes: Axes, rows: pd.DataFrame, settings: Settings, scale: Scale
 
 
 def _breaks(settings: Settings) -> list[int]:
-    """Points at which another setting than the last changes: lines stop there."""
+    """Return points at which another setting than the last changes, to break lines there."""
     return [k for k, point in enumerate(settings.points) if k and point[:-1] != settings.points[k - 1][:-1]]
 
 
 def _label(axes: Axes, rows: pd.DataFrame, measure: str) -> None:
-    """Title, unit and vertical scale of a panel."""
+    """Set title, unit and vertical scale of a panel."""
     (parameter, unit), base = rows[["parameter", "unit"]].iloc[0], measure.partition(":")[0]
     of_parameter = isinstance(parameter, str)
     axes.set_ylabel(
@@ -110,7 +110,7 @@ def _label(axes: Axes, rows: pd.DataFrame, measure: str) -> None:
 
 
 def _draw_stairs(axes: Axes, settings: Settings) -> None:
-    """Which settings each place stands for: one flight for each, higher steps for later values."""
+    """Draw the settings at each place as steps, one row for each setting, higher for later values."""
     for k in range(len(settings.names)):
         values = [point[k] for point in settings.points]
         levels = list(dict.fromkeys(values))
@@ -140,7 +140,7 @@ def _draw_stairs(axes: Axes, settings: Settings) -> None:
 
 
 def _lost(rows: pd.DataFrame) -> str:
-    """How many estimates of an estimator failed, or have no value of some parameter."""
+    """Return how many estimates of an estimator failed, or have no value of some parameter."""
     sums = rows.groupby("parameter", dropna=False)[["n", "failed", "without_value"]].sum()
     runs, failed, without = sums.max().tolist()
     notes = [f"{failed} of {runs} failed"] if failed else []

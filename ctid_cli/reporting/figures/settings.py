@@ -1,4 +1,4 @@
-"""Where the points of a figure lie: the settings that an experiment varies, and the words for them."""
+"""Positions of the points of a figure: the settings that an experiment varies, and their labels."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Settings(NamedTuple):
-    """What varies from group to group of the estimates of an experiment."""
+    """Settings that vary between groups of the estimates of an experiment."""
 
     #: Keys of rows, the last one varying fastest.
     names: tuple[str, ...]
@@ -31,9 +31,9 @@ class Settings(NamedTuple):
 
 
 def placed(frame: pd.DataFrame, results: Results) -> tuple[Settings, pd.DataFrame]:
-    """Return what varies in the rows of an experiment, and the rows with their ``place``.
+    """Return the settings that vary in the rows of an experiment, and the rows with their ``place``.
 
-    A row that lacks a setting, such as an initial delay, is the same at all values of it.
+    A row without a setting, such as an initial delay, counts for all its values.
     """
     import pandas as pd
 
@@ -47,7 +47,7 @@ def placed(frame: pd.DataFrame, results: Results) -> tuple[Settings, pd.DataFram
         for name, value in zip(varied, point, strict=True):
             column = own[name].map(_hashable)
             own = own[column.isna() | (column == value)]
-        # Estimators of one name may differ in options that only some of them have: not every combination is planned.
+        # Estimators of one name may have different options, so not every combination is planned.
         if len(own):
             parts.append(own.assign(place=len(points)))
             points.append(point)
@@ -56,7 +56,7 @@ def placed(frame: pd.DataFrame, results: Results) -> tuple[Settings, pd.DataFram
 
 
 def _ordered(values: Any) -> list[Any]:
-    """Values without repetition, numbers by size and before words."""
+    """Return values without repetition, numbers in order and before words."""
     found = [value for value in dict.fromkeys(map(_hashable, values)) if value is not None and value == value]
     return sorted(found, key=lambda value: (0, value) if _is_number(value) else (1, 0.0))
 
@@ -70,12 +70,12 @@ def _is_number(value: Any) -> bool:
 
 
 def value_text(value: Any) -> str:
-    """A value of a setting."""
+    """Return a value of a setting as text."""
     return plain(number(value))
 
 
 def title_of(name: str, settings: Mapping[str, Any]) -> str:
-    """The name of a swept setting with its unit."""
+    """Return the name of a swept setting with its unit."""
     if name == "initial_delay":
         return "initial delay [s]"
     key, title = name.rpartition(".")[2], "SNR" if name == "snr_db" else name.replace("_", " ")
@@ -87,22 +87,22 @@ def title_of(name: str, settings: Mapping[str, Any]) -> str:
 
 
 class Scale(NamedTuple):
-    """Where the points of a figure stand along its horizontal axis."""
+    """Positions of the points of a figure along its horizontal axis."""
 
     places: list[float]
     logarithmic: bool
-    #: Labels of the places; none where the places are the values themselves.
+    #: Labels of the places; none if the places are the values themselves.
     labels: list[str] | None
 
     def shifted(self, k: int, n: int) -> list[float]:
-        """Places of the k-th of n series, side by side."""
+        """Return the places of the k-th of n series, side by side."""
         moved = [math.log(place) if self.logarithmic else place for place in self.places]
         gaps = [abs(b - a) for a, b in itertools.pairwise(moved) if a != b]
         shift = 0.08 * min(gaps, default=1.0) * (k - 0.5 * (n - 1))
         return [math.exp(place + shift) if self.logarithmic else place + shift for place in moved]
 
     def apply(self, axes: Axes) -> None:
-        """Give a panel this axis."""
+        """Set the axis of a panel."""
         if self.logarithmic:
             from matplotlib.ticker import NullFormatter, NullLocator
 
@@ -116,7 +116,7 @@ class Scale(NamedTuple):
 
 
 def scale_of(settings: Settings) -> Scale:
-    """Numbers of a single setting where they are, by their logarithms if they span decades; all else side by side."""
+    """Place numbers of a single setting by value, or logarithm if they span decades; everything else evenly."""
     if len(settings.names) == 1 and all(_is_number(value) for (value,) in settings.points):
         places = [float(value) for (value,) in settings.points]
         return Scale(places, places[0] > 0 and places[-1] >= 16 * places[0], None)

@@ -1,4 +1,4 @@
-"""What all figures have in common: style, bytes that are the same every time, colours, and labels that do not touch."""
+"""Common parts of all figures: style, reproducible bytes, colours, and labels that do not overlap."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Colours that differ in lightness too, so that a grey print can be read.
+#: Colours of different lightness, for grey prints.
 DARK, MIDDLE, LIGHT, BAND = "#08306b", "#6b6b6b", "#a8a8a8", "#e4e4e4"
-#: What stands out from lines of these colours, by shape as well.
+#: Style of highlights on lines of these colours, also of another shape.
 MARK = "#b03a00"
 #: Line styles of neighbouring curves.
 _STYLES = ("-", "--", "-.", (0, (1, 1)))
-#: Stripes in which a long curve is drawn: three in a millimetre of paper.
+#: Stripes in which a long curve is drawn: three per millimetre of paper.
 STRIPES = 600
 _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "ctid",
@@ -40,8 +40,8 @@ _STYLE: dict[Any, Any] = {
 }
 
 
-#: Looks of the estimators of an experiment: the colours of Okabe and Ito, which the colour-blind tell apart, with a
-#: marker and a line for a grey print.
+#: Styles of the estimators of an experiment: the colours of Okabe and Ito, for the colour-blind, with a marker and a
+#: line for grey prints.
 LOOKS: tuple[dict[str, Any], ...] = (
     {"color": "#0072b2", "marker": "o", "linestyle": "-"},
     {"color": "#d55e00", "marker": "s", "markerfacecolor": "white", "linestyle": "--"},
@@ -54,17 +54,17 @@ LOOKS: tuple[dict[str, Any], ...] = (
 )
 
 Format = Literal["svg", "png", "pdf"]
-#: What else each format would write down: when, and by which version of what.
+#: Metadata of each format that are left out: date and versions.
 _METADATA: dict[Format, Any] = {"svg": {"Date": None}, "png": {"Software": None}, "pdf": {"CreationDate": None}}
 
 
 def load_matplotlib() -> None:
-    """Begin to import what draws figures; meanwhile compiled kernels go on."""
+    """Start to import Matplotlib, while compiled kernels continue."""
     Thread(target=_import_matplotlib).start()
 
 
 def _import_matplotlib() -> None:
-    # The caller reports what is missing.
+    # The caller reports a failed import.
     with suppress(ImportError):
         import matplotlib.backends.backend_svg
         import matplotlib.figure  # noqa: F401
@@ -81,32 +81,32 @@ class Picture(bytes):
 
 
 class Drawing(NamedTuple):
-    """A figure that is still to be drawn."""
+    """A figure to draw."""
 
     width: float  # [inch]
     height: float
     draw: Callable[[Figure], None]
 
     def figure(self) -> Figure:
-        """Draw it."""
+        """Draw the figure."""
         with _style():
             figure = _notebook_figure()(figsize=(self.width, self.height), layout="constrained")
             self.draw(figure)
         return figure
 
     def picture(self) -> Picture:
-        """Draw it for a notebook."""
+        """Draw the figure for a notebook."""
         return Picture(self.saved())
 
     def saved(self, style: Format = "svg") -> bytes:
-        """Draw it as a file; the same drawing always gives the same bytes."""
+        """Draw the figure as a file; the same drawing always gives the same bytes."""
         file, figure = io.BytesIO(), self.figure()
         with _style():
             figure.savefig(file, format=style, metadata=_METADATA[style], dpi=200)
         return file.getvalue()
 
     def laid_out_once(self) -> bytes:
-        """Draw it as SVG in half the time: places are found once, and may differ from those of ``saved`` by a hair."""
+        """Draw as SVG in half the time: the layout is computed once, and may differ slightly from ``saved``."""
         file, figure = io.BytesIO(), self.figure()
         with _style():
             figure.draw_without_rendering()
@@ -117,7 +117,7 @@ class Drawing(NamedTuple):
 
 @cache
 def _notebook_figure() -> type[Figure]:
-    """Return the class of figures that a notebook shows without pyplot, with Matplotlib that is loaded now."""
+    """Return the class of figures that a notebook shows without pyplot; Matplotlib is loaded by then."""
     from matplotlib.figure import Figure
 
     class NotebookFigure(Figure):
@@ -130,21 +130,21 @@ def _notebook_figure() -> type[Figure]:
 
 
 def _style() -> Any:
-    """Not the user's own defaults: a published figure looks the same everywhere."""
+    """Return a style independent of the user's defaults, for reproducible figures."""
     import matplotlib.style
 
     return matplotlib.style.context(["default", _STYLE])
 
 
 def require_kind(kind: str | None, known: Sequence[str]) -> None:
-    """Refuse a kind of figure that there is not."""
+    """Refuse an unknown kind of figure."""
     if kind is not None and kind not in known:
         hint = did_you_mean(kind, known) or ";"
         raise UsageError(f"there is no kind of figure {kind!r}{hint} there are {', '.join(known)}")
 
 
 def plain(text: str) -> str:
-    """A text of others, in which nothing is a formula."""
+    """Escape a text, so that nothing in it is read as a formula."""
     return text.replace("$", r"\$")
 
 
@@ -159,12 +159,12 @@ def name_axes(axes: Any, x: str = "", y: str = "", legend: str = "") -> None:
 
 
 def look(k: int) -> dict[str, Any]:
-    """The look of the k-th estimator."""
+    """Return the style of the k-th estimator."""
     return LOOKS[k % len(LOOKS)]
 
 
 def panels_of(figure: Figure, n: int, columns: int | None = None, **shared: Any) -> list[Any]:
-    """Return ``n`` panels in rows; where panels share an axis, the lowest of each column still has its numbers."""
+    """Return ``n`` panels in rows; with a shared axis, the lowest of each column shows its numbers."""
     across = columns or columns_for(n)
     panels = list(figure.subplots(-(-n // across), across, squeeze=False, **shared).flat)
     for k, axes in enumerate(panels):
@@ -175,17 +175,17 @@ def panels_of(figure: Figure, n: int, columns: int | None = None, **shared: Any)
 
 
 def columns_for(n: int) -> int:
-    """How many of n panels stand side by side."""
+    """Return the number of columns for n panels."""
     return 2 if n in (2, 4) else min(n, 3)
 
 
 def size_for(n: int, columns: int | None = None) -> tuple[float, float]:
-    """Width and height of a figure with n panels, a title and a legend [inch]."""
+    """Return width and height of a figure with n panels, a title and a legend [inch]."""
     return (7.5, 1.2 + 2.2 * -(-n // (columns or columns_for(n)))) if n > 1 else (5.5, 4.2)
 
 
 def legend_of(figure: Figure, looks: Mapping[str, Mapping[str, Any]], columns: int, **others: Any) -> None:
-    """Name series below a figure by their looks."""
+    """Label series below a figure by their styles."""
     from matplotlib.lines import Line2D
 
     style = {"markersize": 4, "linewidth": 0.9}
@@ -194,15 +194,15 @@ def legend_of(figure: Figure, looks: Mapping[str, Mapping[str, Any]], columns: i
 
 
 def pointed(axes: Any, text: str, point: ArrayLike, place: ArrayLike, arrow: dict[str, Any], **style: Any) -> None:
-    """A text beside the axes with a thin line to the point that it speaks of."""
+    """Write a text outside the axes, with a thin line to the point it describes."""
     line: dict[str, Any] = {"arrowstyle": "-", "shrinkA": 0, "shrinkB": 0}
     axes.annotate(text, point, place, va="center", annotation_clip=False, arrowprops=line | arrow, **style)
 
 
 def outline(t: Array, values: Array) -> tuple[Array, Array]:
-    """A curve by the least and the greatest value of each stripe, where it has more points than an eye can tell apart.
+    """Return the least and greatest value of a curve in each stripe, if it has more points than can be seen.
 
-    A stripe without a number keeps its gap.
+    A stripe without a number remains a gap.
     """
     if values.size <= 4 * STRIPES:
         return t, values
@@ -214,7 +214,7 @@ def outline(t: Array, values: Array) -> tuple[Array, Array]:
 
 
 def ramp(count: int) -> list[dict[str, Any]]:
-    """Line properties of a family of curves, from light to dark, neighbours with different dashes."""
+    """Return line properties of a family of curves, from light to dark, neighbours with different dashes."""
     light, dark = np.array([0.52, 0.68, 0.84]), np.array([0.03, 0.12, 0.30])
     shares = np.linspace(0.0, 1.0, count) if count > 1 else np.ones(1)
     return [
@@ -224,7 +224,7 @@ def ramp(count: int) -> list[dict[str, Any]]:
 
 
 def spread(values: ArrayLike, distance: float) -> Array:
-    """Places of labels: as close to their values as a least distance allows, in the same order."""
+    """Return positions of labels, as close to their values as a least distance allows, in the same order."""
     values = np.asarray(values, dtype=float)
     groups: list[list[int]] = []
 

@@ -1,1 +1,1 @@
-"""Pages in HTML that open anywhere: one file each, without scripts and without anything that must be fetched."""
+"""Self-contained HTML pages: one file each, without scripts and external resources."""

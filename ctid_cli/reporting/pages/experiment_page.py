@@ -1,4 +1,4 @@
-"""The page of one experiment: what was asked, what came out, how sure that is, and how to get it again."""
+"""Page of one experiment: question, results, uncertainty, and how to reproduce it."""
 
 import itertools
 from collections.abc import Iterator, Mapping
@@ -24,11 +24,11 @@ from ctid_cli.storage.sqlite_file import SPEC
 from ctid_cli.storage.status import public_sessions
 from ctid_cli.text import count
 
-#: What is measured of every simulated system, beside what the specification asks for.
+#: Measures of every simulated system, besides those of the specification.
 MEASURES = ("bias", "rmse", "coverage")
-#: Up to this number of estimators are compared pairwise; more of them with the first one.
+#: Up to this number of estimators are compared pairwise; more only with the first one.
 ALL_PAIRS = 3
-#: Kinds of failure that are listed.
+#: Most kinds of failure that are listed.
 FAILURES_LISTED = 20
 
 
@@ -53,7 +53,7 @@ def experiment_page(results: Results, out: Path) -> str:
 
 
 def _counts(results: Results) -> str:
-    """How much there is."""
+    """Return the size of the experiment in words."""
     manifest = results.manifest
     methods = len({part["name"] for part in manifest["estimators"]})
     sets = sum(cell["replicates"] for cell in manifest["data_cells"])
@@ -83,7 +83,7 @@ def _question(results: Results) -> Iterator[Section]:
 
 
 def _tables(results: Results) -> list[Section]:
-    """Return the tables of ``ctid table``, and the usual measures where they are not among them."""
+    """Return the tables of ``ctid table``, and the usual measures if they are not among them."""
     tables = [experiment_table(results)]
     if results.is_simulated:
         others = [name for name in MEASURES if name not in default_measures(results)]
@@ -105,7 +105,7 @@ def _figures(results: Results, out: Path) -> Iterator[Section]:
 
 
 def _comparisons(results: Results, out: Path) -> Iterator[Section]:
-    """Return differences of estimators on the same data sets, where they have enough of them in common."""
+    """Yield differences of estimators on the same data sets, if enough of them are common."""
     names = list(dict.fromkeys(part["name"] for part in results.manifest["estimators"]))
     pairs = itertools.combinations(names, 2)
     for pair in pairs if len(names) <= ALL_PAIRS else ((names[0], name) for name in names[1:]):
@@ -116,7 +116,7 @@ def _comparisons(results: Results, out: Path) -> Iterator[Section]:
 
 
 def _outcomes(results: Results, out: Path) -> list[Section]:
-    """Return how the estimates ended that did not end well, with the command that shows one of them."""
+    """Return the outcomes of unsuccessful estimates, with the command that shows one of them."""
     rows = results.stored
     well = np.isin(rows.column("status"), [status.encode() for status in SUCCESSES])
     failed = list(rows.chosen(~well).rows("estimator", "status", "message", "id"))
@@ -132,7 +132,7 @@ def _outcomes(results: Results, out: Path) -> list[Section]:
 
 
 def _provenance(results: Results, sessions: list[dict[str, Any]]) -> Iterator[Section]:
-    """Return what computed the results."""
+    """Yield the origin of the results."""
     seed = results.manifest["seed"]
     sown = "" if seed is None else f", seed {seed}"
     made = f"Specification {results.manifest['spec_hash'][:16]}{sown}; page by ctid {ctid_cli.__version__}."
@@ -156,7 +156,7 @@ def _versions(packages: Mapping[str, str]) -> str:
 
 
 def _cited(results: Results) -> Section:
-    """Return what to cite."""
+    """Return the articles to cite."""
     seed = results.manifest["seed"]
     own = f"ctid {ctid_cli.__version__}, experiment {results.experiment}, "
     own += f"specification {results.manifest['spec_hash'][:16]}{'' if seed is None else f', seed {seed}'}."

@@ -1,4 +1,4 @@
-"""How a page is put together: chapters of sections in one template, with every text of others escaped."""
+"""Construction of a page: chapters of sections in one template, with all external text escaped."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ if TYPE_CHECKING:
     from jinja2 import Template
     from markupsafe import Markup
 
-#: Rows of a table that a page shows; the tables of ``ctid table`` have all of them.
+#: Most rows of a table on a page; the tables of ``ctid table`` have all of them.
 ROWS = 200
-#: A drawing as wide as a page of paper, 7.5 inch, has 52 rem on the screen.
+#: A drawing as wide as a page of paper, 7.5 inch, is 52 rem wide on the screen.
 REM_PER_POINT = 52.0 / (7.5 * 72.0)
 
 
 class Chapter(NamedTuple):
-    """Sections under one heading, which the contents of a page name."""
+    """Sections under one heading, listed in the contents of a page."""
 
     title: str
     sections: Sequence[Section]
 
     @property
     def name(self) -> str:
-        """Return the anchor of the chapter."""
+        """Anchor of the chapter."""
         return re.sub(r"\W+", "-", self.title.lower())
 
 
 def write_page(title: str, lead: str, chapters: Sequence[Chapter]) -> str:
-    """Return a page as HTML that opens anywhere and loads nothing; empty chapters are left out."""
+    """Return a self-contained HTML page; empty chapters are left out."""
     known = [chapter for chapter in chapters if chapter.sections]
     return _template().render(version=ctid_cli.__version__, title=title, lead=lead, chapters=known)
 
@@ -74,23 +74,23 @@ def _drawn(drawing: Drawing | bytes, name: str) -> Markup:
 
 
 def inline(svg: bytes, name: str) -> Markup:
-    """Return a drawing as part of a page; its names get a prefix, since those of all drawings are the same."""
+    """Return a drawing as part of a page; its identifiers get a prefix, since those of all drawings are the same."""
     from markupsafe import Markup
 
     text = svg.decode("utf-8")
     drawn = text[text.index("<svg") :]
     drawn = re.sub(r'\bid="', f'id="{name}-', drawn)
     drawn = re.sub(r'href="#', f'href="#{name}-', drawn).replace("url(#", f"url(#{name}-")
-    # The drawing's own description holds nothing but addresses of vocabularies.
+    # The drawing's own description contains only addresses of vocabularies.
     drawn = re.sub(r"<metadata>.*?</metadata>", "", drawn, flags=re.DOTALL)
-    # All drawings at one scale, so that their letters have one size.
+    # All drawings have one scale, so that their letters have one size.
     width = re.search(r'<svg [^>]*?width="([\d.]+)pt"', drawn)
     scale = f' style="max-width: {float(width[1]) * REM_PER_POINT:.4g}rem"' if width else ""
     return Markup(drawn.replace("<svg ", f'<svg role="img"{scale} ', 1))
 
 
 def shown(word: str) -> str:
-    """Return a word without its folder: a page is sent to others, and names no folder of this machine."""
+    """Return a word without its folder: pages are sent to others, and show no folder of this machine."""
     return PurePath(word).name if PurePath(word).is_absolute() else word
 
 
@@ -100,12 +100,12 @@ def shown_command(command: str | None) -> str:
 
 
 class PagedResult(Result):
-    """A result of a record that has a page: what it is, whether to believe it, and how to get it again."""
+    """A result of a record that has a page: content, diagnostics, and how to reproduce it."""
 
     @property
     @abstractmethod
     def fine(self) -> str:
-        """What stands in the place of warnings."""
+        """Sentence in place of warnings."""
 
     @abstractmethod
     def page_head(self) -> tuple[str, str]:
@@ -113,14 +113,14 @@ class PagedResult(Result):
 
     @abstractmethod
     def chapters(self) -> Iterable[Chapter]:
-        """Return what the page shows."""
+        """Return the chapters of the page."""
 
     @abstractmethod
     def cited(self) -> Sequence[str]:
         """Return keys of ``citations.bib``."""
 
     def page(self, stored: Mapping[str, Any]) -> str:
-        """Return the page as HTML, with what the file of the result says of its origin."""
+        """Return the page as HTML, with the origin stored in the file of the result."""
         warnings = [f"- {text}" for text in stored["warnings"]] or [self.fine]
         words = ["ctid, and what this result used of others:", bibtex("ctid", *self.cited())]
         chapters = [
@@ -140,7 +140,7 @@ def bibtex(*keys: str) -> str:
 
 
 def _provenance(stored: Mapping[str, Any]) -> list[Section]:
-    """Return what a result was made from, and the command that makes it again."""
+    """Return the data of a result, and the command that reproduces it."""
     sources = [("record", each) for each in stored.get("records", [stored.get("record")])]
     sources += [("validation record", stored["validation"])] if stored.get("validation") else []
     rows = [("ctid", str(stored["ctid"]))]

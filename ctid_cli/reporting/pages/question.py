@@ -1,4 +1,4 @@
-"""What an experiment asks: the equation of its system, and the articles whose methods its estimators are."""
+"""Question of an experiment: the equation of its system, and the articles on its estimators."""
 
 import inspect
 import re
@@ -12,7 +12,7 @@ SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def formula_of(settings: Mapping[str, Any]) -> str:
-    """Return the transfer function of a system whose equation is known, else an empty text."""
+    """Return the transfer function of a system with a known equation, else an empty text."""
     system = settings.get("system") or {}
     if "additive" in system:
         terms = [(item["numerator"], item["denominator"], item.get("integrators") or 0) for item in system["additive"]]
@@ -24,7 +24,7 @@ def formula_of(settings: Mapping[str, Any]) -> str:
 
 
 def formula(terms: Sequence[tuple[Sequence[float], Sequence[float], int]], *, delayed: bool, digits: int = 15) -> str:
-    """Return a sum of fractions, each with poles at the origin besides, as one line."""
+    """Return a sum of fractions, each with its poles at the origin, as one line."""
     shown = []
     for numerator, denominator, integrators in terms:
         above, below = _bracketed(polynomial(numerator, digits)), _bracketed(polynomial(denominator, digits))
@@ -56,7 +56,7 @@ def _power(power: int) -> str:
 
 
 def references(settings: Mapping[str, Any]) -> list[str]:
-    """The articles whose methods the estimators are."""
+    """Return the articles on the methods of the estimators."""
     found: dict[str, None] = {}
     for content in settings["estimators"].values():
         for section in ("estimator", "frequency_estimator"):

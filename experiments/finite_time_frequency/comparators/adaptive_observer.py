@@ -10,10 +10,10 @@ from ctid_cli import DataError, Flag, FrequencyEstimator, FrequencyTrack
 
 from .common import complete_samples, is_certain, require_positive, scaled_inverses
 
-#: Rate of the adaptation [1/s], and the time before which there is none [s].
+#: Rate of the adaptation [1/s], and the time at which it starts [s].
 RATE = 0.3
 HOLD = 2.0
-#: Frequencies are kept within bounds, and apart from each other [rad/s].
+#: Bounds of the frequencies, and their least distance [rad/s].
 LOWEST = 0.2
 HIGHEST = 8.0
 SMALLEST_GAP = 0.3
@@ -30,7 +30,7 @@ class AdaptiveObserver(FrequencyEstimator):
     tones : int
         Number of sinusoids n, 1 to 8.
     initial_frequencies : tuple of float
-        Frequencies to begin with [rad/s], ascending 0.3 apart, from 0.2 to 8.
+        Initial frequencies [rad/s], ascending 0.3 apart, from 0.2 to 8.
     pole : float, default 2.0
         Slowest rate of the observer [rad/s], near the frequencies.
     ratio : float, default 1.2
@@ -98,9 +98,9 @@ class AdaptiveObserver(FrequencyEstimator):
         return FrequencyTrack(interval * np.arange(count), omega, flags.astype(np.uint16))
 
     def _possible_errors(self, omega, prediction, initial, interval):
-        """Return the error that the mean squared residual makes in its worst direction, and where it is known.
+        """Return the error that the mean squared residual can cause in its worst direction, and where it is known.
 
-        What an estimate still moves is added: it is not where it will be.
+        The present drift of the estimate is added, as it has not converged.
         """
         forget = RATE * interval
         error, xi = prediction[:, 0], prediction[:, 1:]
@@ -115,12 +115,12 @@ class AdaptiveObserver(FrequencyEstimator):
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Compiled: a kernel calls only kernels of this file, because Numba's cache on disk looks only at the file of a function
+# Compiled: a kernel calls only kernels of this file, because Numba's cache on disk checks only the file of a function.
 
 
 @njit(cache=True, nogil=True)
 def place_poles(squares, poles, gains):
-    """Observer gains for given squared frequencies."""
+    """Compute the observer gains for given squared frequencies."""
     # prod(s^2 + w_i^2) + sum (l_i1 s + l_i2) prod_(j != i)(s^2 + w_j^2) = prod(s + p_k), compared at s = j w_i.
     for i in range(squares.size):
         omega = np.sqrt(squares[i])
@@ -137,7 +137,7 @@ def place_poles(squares, poles, gains):
 
 @njit(cache=True, nogil=True)
 def observer_slope(states, y, squares, gains, slope):
-    """Time derivative of the observer (row 0) and of its sensitivities to each squared frequency (other rows)."""
+    """Compute the time derivative of the observer (row 0) and of its sensitivities to each squared frequency."""
     n = squares.size
     for p in range(n + 1):
         # The sensitivities obey the same equations, without the signal.
@@ -154,11 +154,11 @@ def observer_slope(states, y, squares, gains, slope):
 
 @njit(cache=True, nogil=True)
 def predict(before, change, interval, squares, gains, states, stage, total, slope):
-    """Classical Runge-Kutta step of the states for a signal that changes linearly over the interval."""
+    """Take a classical Runge-Kutta step of the states for a signal that changes linearly over the interval."""
     now, start, sums, steps = stage.ravel(), states.ravel(), total.ravel(), slope.ravel()
     now[:] = start
     sums[:] = 0.0
-    # Where in the interval a slope is taken, its weight, and how far it leads to the next one.
+    # Place in the interval at which a slope is taken, its weight, and the step from it to the next one.
     for share, weight, ahead in ((0.0, 1.0, 0.5), (0.5, 2.0, 0.5), (0.5, 2.0, 1.0), (1.0, 1.0, 1.0)):
         observer_slope(stage, before + share * change, squares, gains, slope)
         for i in range(start.size):
@@ -170,18 +170,18 @@ def predict(before, change, interval, squares, gains, states, stage, total, slop
 
 @njit(cache=True, nogil=True)
 def move(squares, states, step, bounds):
-    """Change the squared frequencies within bounds, and the states with them; returns whether a bound was met."""
+    """Change the squared frequencies within bounds, and the states with them; return whether a bound was met."""
     n = squares.size
     smallest_gap, lowest, highest = bounds
     met = False
     for p in range(n):
-        # From the lowest frequency upwards, each leaves room for those above it: equal ones have no finite gains.
+        # From the lowest frequency upwards, each keeps a distance for those above it: equal ones have no finite gains.
         wanted = max(squares[p] + step[p], 0.0)
         ceiling = highest - (n - 1 - p) * smallest_gap
         frequency = min(max(np.sqrt(wanted), lowest), ceiling)
         allowed = wanted if frequency == np.sqrt(wanted) else frequency * frequency
         met |= allowed != wanted
-        # To first order, the states are what they would be had these frequencies been there before.
+        # To first order, the states become those for these frequencies in the past.
         for i in range(2 * n):
             states[0, i] += states[p + 1, i] * (allowed - squares[p])
         squares[p] = allowed
@@ -191,9 +191,9 @@ def move(squares, states, step, bounds):
 
 @njit(cache=True, nogil=True)
 def observe(y, interval, poles, rate, hold, bounds, initial, omega, prediction, bounded):
-    """Observer, sensitivities and recursive Gauss-Newton steps.
+    """Run observer, sensitivities and recursive Gauss-Newton steps.
 
-    Of every sample it writes the frequencies, shape (N, n), the error of the prediction and its sensitivities to the
+    For every sample it writes the frequencies, shape (N, n), the error of the prediction and its sensitivities to the
     squared frequencies, shape (N, n + 1), and whether a bound was met, shape (N,).
     """
     n = initial.size
@@ -205,7 +205,7 @@ def observe(y, interval, poles, rate, hold, bounds, initial, omega, prediction, 
     for k in range(1, y.size):
         place_poles(squares, poles, gains)
         predict(y[k - 1], y[k] - y[k - 1], interval, squares, gains, states, stage, total, slope)
-        # The prediction is the sum of the tones; so are its sensitivities those of theirs.
+        # The prediction is the sum of the tones, and its sensitivities are the sums of theirs.
         prediction[k, 0] = y[k]
         for i in range(n):
             prediction[k, 0] -= states[0, 2 * i]
@@ -218,7 +218,7 @@ def observe(y, interval, poles, rate, hold, bounds, initial, omega, prediction, 
                 moments[p, j] += forget * (xi[p] * xi[j] - moments[p, j])
             trace += moments[p, p]
         if k >= hold and 0.0 < trace < np.inf:
-            # The ridge bounds the step while the moments are nearly singular, the newest row while they nearly vanish.
+            # The ridge bounds the step for nearly singular moments, the newest row for nearly vanishing ones.
             matrix[:] = moments
             for p in range(n):
                 matrix[p, p] += TRACE_RIDGE * trace + forget * xi[p] * xi[p]

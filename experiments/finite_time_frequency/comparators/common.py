@@ -1,20 +1,20 @@
-"""What the comparators share: samples, options, and when an estimate of frequencies is certain."""
+"""Common parts of the comparators: samples, options, and the certainty of an estimate of frequencies."""
 
 import numpy as np
 
 from ctid_cli import DataError
 
-#: Frequencies are called certain while the error that the misfit of the equations can make stays below this fraction of
-#: the frequency itself and of the distance to its neighbours, as in ctid's own estimators.
+#: Frequencies are certain while the error that the misfit of the equations can cause is below this fraction of the
+#: frequency itself and of the distance to its neighbours, as in ctid's own estimators.
 CERTAIN_FRACTION = 0.1
-#: An estimation younger than this many periods, or beats of neighbours, is less certain than its misfit shows.
+#: An estimate over fewer periods, or beats of neighbours, than this is less certain than its misfit shows.
 FIRST_PERIODS = 2.0
-#: What is left of a column of second moments that the others explain is rounding.
+#: The remainder of a column of second moments that the others explain is rounding.
 SINGULAR = 4e-16
 
 
 def complete_samples(samples):
-    """Return a copy of the samples, of which none may be missing."""
+    """Return a copy of the samples; refuse missing ones."""
     y = np.array(samples, dtype=float)
     if y.ndim != 1 or not np.isfinite(y).all():
         raise DataError("the samples must be one series of finite numbers; this estimator takes no missing ones")
@@ -32,11 +32,11 @@ def require_positive(options, *names):
 def is_certain(omega, error, span, elapsed, rounding=0.0):
     """Return whether rows of frequencies are certain, shape (N,).
 
-    An error that the misfit can make, shape (N, n), is compared with the frequency itself and with the distance to its
-    neighbours. Within a part of a period, or of the beat of two neighbours, a bias or another tone hardly differs from
-    a change of the frequencies and hardly shows as a misfit; measured errors grow like the fifth power of the missing
-    part. The same holds for the first two periods, whatever the span [s] that the estimate rests on. Rounding errors do
-    not shrink with time, and are not enlarged by the lack of it.
+    An error that the misfit can cause, shape (N, n), is compared with the frequency itself and with the distance to its
+    neighbours. Within a part of a period, or of the beat of two neighbours, a bias or another tone is similar to a
+    change of the frequencies and hardly visible as a misfit; measured errors grow like the fifth power of the missing
+    part. The same holds for the first two periods, for any span [s] of the estimate. Rounding errors do not decrease
+    with time, and are not enlarged at its beginning.
     """
     gaps = np.diff(omega, axis=1, prepend=0.0)
     room = np.minimum(gaps, np.pad(gaps[:, 1:], ((0, 0), (0, 1)), constant_values=np.inf))
@@ -47,7 +47,7 @@ def is_certain(omega, error, span, elapsed, rounding=0.0):
 
 
 def scaled_inverses(moments):
-    """Return scales, inverses of the matrices with unit diagonal, and whether these are not singular.
+    """Return scales, inverses of the matrices with unit diagonal, and whether these are non-singular.
 
     Parameters
     ----------

@@ -13,9 +13,9 @@ from ctid_cli import DataError, Flag, FrequencyEstimator, FrequencyTrack
 
 from .common import complete_samples, is_certain, require_positive, scaled_inverses
 
-#: Before this time there is no estimate [s].
+#: Time of the first estimate [s].
 HOLD = 1.0
-#: The estimate is decoded anew every so many samples.
+#: Number of samples between two computations of the frequencies.
 REFRESH = 5
 #: Second moments summed over many samples carry relative errors of about this size.
 ROUNDING = 4e-15
@@ -32,13 +32,13 @@ class FilterRegression(FrequencyEstimator):
     pole : float
         Rate of the filter [rad/s], near the frequencies.
     forgetting : float, default 0.5
-        Rate at which old data are forgotten [1/s].
+        Forgetting rate of old data [1/s].
     algorithm : {"least_squares", "gradient"}, default "least_squares"
-        How the parameters are adapted.
+        Adaptation of the parameters.
     gains : tuple of float, optional
         Gains of the gradient algorithm, one for each parameter; 1 if not given.
     initial_frequencies : tuple of float, optional
-        Frequencies to begin with [rad/s]; by default spread up to ``pole``.
+        Initial frequencies [rad/s]; by default spread up to ``pole``.
 
     Notes
     -----
@@ -83,10 +83,10 @@ class FilterRegression(FrequencyEstimator):
         n, count = self.tones, y.size
         initial = np.sort(self.initial_frequencies or self.pole * np.arange(1, n + 1) / n)
         rows = filter_chain(y, self.pole, 2 * n, interval) @ derivative_rows(n, self.pole).T
-        # The chain begins at rest with the first sample.
+        # The chain begins at rest at the first sample.
         rows[0] = 0.0
 
-        # Estimates are decoded at these samples, and hold until the next one; before the first the initial ones do.
+        # Estimates are computed at these samples and held until the next one; before the first the initial ones apply.
         hold = round(HOLD / interval)
         decoded = np.arange(max(hold, REFRESH), count, REFRESH)
         keep = np.exp(-self.forgetting * interval)
@@ -100,7 +100,7 @@ class FilterRegression(FrequencyEstimator):
         span = np.minimum(elapsed, 2.0 / self.forgetting + 2 * n / self.pole)
         found, verdicts = self._estimates(moments, coefficients, span, elapsed)
 
-        # Singular moments determine nothing, and leave the estimate as it was.
+        # Singular moments determine nothing, and leave the estimate unchanged.
         last = np.maximum.accumulate(np.where(verdicts == Flag.UNDETERMINED, -1, np.arange(decoded.size)))
         found = np.vstack((initial, found))[1 + last]
         newest = np.searchsorted(decoded, np.arange(count), side="right")
@@ -110,7 +110,7 @@ class FilterRegression(FrequencyEstimator):
         return FrequencyTrack(interval * np.arange(count), omega, flags.astype(np.uint16))
 
     def _estimates(self, moments, coefficients, span, elapsed):
-        """Return the frequencies that second moments, or given coefficients, make, and why they are not valid."""
+        """Return the frequencies from second moments, or from given coefficients, and flags of invalid ones."""
         n = self.tones
         scales, inverses, determined = scaled_inverses(moments[:, :n, :n])
         inverses = inverses / (scales[:, :, None] * scales[:, None, :])
@@ -119,8 +119,8 @@ class FilterRegression(FrequencyEstimator):
         roots, flags = positive_roots(coefficients)
         omega = np.sqrt(roots)
 
-        # The misfit of the equations moves a frequency by at most sqrt(g' G^-1 g e'e), with g its derivatives to the
-        # coefficients (Cauchy-Schwarz); as a difference of moments it is known up to rounding only.
+        # The misfit of the equations moves a frequency by at most sqrt(g' G^-1 g e'e), with g its derivatives with
+        # respect to the coefficients (Cauchy-Schwarz); as a difference of moments it is known up to rounding only.
         weights = np.column_stack((-coefficients, np.ones(span.size)))
         misfit = np.maximum(np.einsum("mi,mij,mj->m", weights, moments, weights), 0.0)
         size = np.sqrt(moments[:, n, n]) + (np.abs(coefficients) * scales).sum(axis=1)
@@ -159,7 +159,7 @@ def filter_chain(y, pole, order, interval):
     chain = np.column_stack((y, np.zeros((y.size, order))))
     before, change = y[:-1], np.diff(y)
     for i in range(order):
-        # Lower triangular: a filter sees only those before it.
+        # Lower triangular: the input of a filter depends only on those before it.
         driving = step[i, order] * before + step[i, order + 1] * change + chain[:-1, 1 : 1 + i] @ step[i, :i]
         chain[1:, 1 + i] = lfilter([1.0], [1.0, -step[i, i]], driving)
     return chain
@@ -179,7 +179,7 @@ def positive_roots(coefficients):
 
 
 def root_derivatives(roots):
-    """Return the derivatives of the roots to the coefficients a_1 ... a_n, shape (N, n, n)."""
+    """Return the derivatives of the roots with respect to the coefficients a_1 ... a_n, shape (N, n, n)."""
     n = roots.shape[1]
     # d x_i/d a_k = -x_i^(n-k)/prod_j(x_i - x_j): implicit derivative of the polynomial at its root.
     differences = roots[:, :, None] - roots[:, None, :] + np.eye(n)

@@ -9,20 +9,20 @@ from ctid_cli import DataError, Flag, FrequencyEstimator, FrequencyTrack
 
 from .common import complete_samples, is_certain
 
-#: Rows of ESPRIT's Hankel matrix as a fraction of the samples, and the largest number of them.
+#: Rows of ESPRIT's Hankel matrix as a fraction of the samples, and their largest number.
 ROWS_FRACTION = 0.4
 MOST_ROWS = 400
-#: More samples than this make a matrix too large to decompose; averages show as much.
+#: More samples than this make the matrix too large to decompose; averages are nearly as informative.
 MOST_AVERAGES = 100_000
 #: Singular values below this fraction of the largest are rounding.
 RANK_TOLERANCE = 1e-11
-#: Below this ratio of the singular values the sinusoids cannot be told apart.
+#: Below this ratio of the singular values the sinusoids cannot be distinguished.
 SINGULAR = 1e-10
-#: A residual below this fraction of the signal (root mean squares) is rounding, and may as well be this large.
+#: A residual below this fraction of the signal (root mean squares) is rounding, and is replaced by this fraction.
 ROUNDING = 1e-13
-#: Probability with which white noise alone has a tone that is called one.
+#: Probability with which white noise alone is accepted as a tone.
 FALSE_TONE = 1e-6
-#: Gauss-Newton steps end when one turns no phase by more than this over the record [rad], or after so many.
+#: Gauss-Newton steps end if one changes all phases by less than this over the record [rad], or after this number.
 TOLERANCE = 1e-8
 MOST_STEPS = 50
 #: Halvings of a step that raises the cost by more than these fractions of itself and of the signal's square.
@@ -40,8 +40,8 @@ class Esprit(FrequencyEstimator):
     tones : int
         Number of sinusoids n, 1 to 8.
     averaging : float, default 0.0
-        Blocks of this length are averaged first [s], so that some hundred samples are left; 0 for none. Frequencies
-        must lie below pi over this time.
+        Blocks of this length are averaged first [s], to leave some hundred samples; 0 for none. Frequencies must lie
+        below pi over this time.
 
     Notes
     -----
@@ -64,11 +64,11 @@ class Esprit(FrequencyEstimator):
             raise DataError(f"averaging must not be negative, not {self.averaging!r}", "averaging")
 
     def check(self, count, interval):
-        """Refuse records of which too few averages are left, or too many."""
+        """Refuse records with too few averages left, or too many."""
         self._blocks(count, interval)
 
     def _blocks(self, count, interval):
-        """Return samples in an average, and rows of the Hankel matrix."""
+        """Return the number of samples in an average, and of rows of the Hankel matrix."""
         block = max(1, round(min(self.averaging / interval, float(count))))
         averages = count // block
         rows = min(int(ROWS_FRACTION * averages), MOST_ROWS)
@@ -96,7 +96,7 @@ class Esprit(FrequencyEstimator):
         rotations = np.linalg.eigvals(np.linalg.lstsq(basis[:-1], basis[1:], rcond=None)[0])
         angles = np.sort(np.angle(rotations[np.imag(rotations) > 0]))
         if angles.size < n:
-            # Real eigenvalues: a constant, an alternating or a vanishing part instead of a sinusoid.
+            # Real eigenvalues: a constant, an alternating or a vanishing part in place of a sinusoid.
             flags |= Flag.COMPLEX_ROOTS
             angles = np.sort(np.abs(np.angle(rotations)))[::2]
         return whole_track(y, interval, angles / (block * interval), flags)
@@ -118,7 +118,7 @@ class NonlinearLeastSquares(Esprit):
     Minimises the sum of squares over frequencies and amplitudes. The amplitudes are eliminated in every step (variable
     projection), and the Gauss-Newton step of the frequencies is halved until it lowers the cost. In white Gaussian
     noise the estimate reaches the Cramer-Rao bound. The cost has many minima about 2 pi/T apart, T the length of the
-    record, so the start must be close: ESPRIT is.
+    record, so it needs a close start, which ESPRIT gives.
 
     References
     ----------
@@ -127,7 +127,7 @@ class NonlinearLeastSquares(Esprit):
     """
 
     def track(self, samples, interval):
-        """Return the end of Gauss-Newton steps from the frequencies of ESPRIT."""
+        """Return the result of Gauss-Newton steps from the frequencies of ESPRIT."""
         y = complete_samples(samples)
         flags = Flag(0)
         omega = super().track(y, interval).frequencies[0]
@@ -156,7 +156,7 @@ class NonlinearLeastSquares(Esprit):
 
 
 def centred_times(count, interval):
-    """Return the instants with the middle of the record as origin: sines and cosines are most different there."""
+    """Return the instants with the middle of the record as origin, where sines and cosines are least correlated."""
     return interval * (np.arange(count) - 0.5 * (count - 1))
 
 
@@ -171,11 +171,11 @@ def fit_amplitudes(y, t, omega):
 
 
 def frequency_step(y, t, omega):
-    """Return the Gauss-Newton step of the frequencies, the error that the residual can make, and its square."""
+    """Return the Gauss-Newton step of the frequencies, the error that the residual can cause, and its square."""
     n = omega.size
     design, coefficients, residual = fit_amplitudes(y, t, omega)
     slopes = t[:, None] * (design[:, n:] * coefficients[:n] - design[:, :n] * coefficients[n:])
-    # What of the slopes the amplitudes cannot follow.
+    # Part of the slopes that is orthogonal to the amplitudes.
     orthogonal, _ = np.linalg.qr(design)
     slopes -= orthogonal @ (orthogonal.T @ slopes)
     cost, scales = float(residual @ residual), np.linalg.norm(slopes, axis=0)
@@ -190,10 +190,10 @@ def frequency_step(y, t, omega):
 
 
 def whole_track(y, interval, omega, flags):
-    """Return the track of one row, with the flags that possible errors and amplitudes call for.
+    """Return the track of one row, with the flags from possible errors and amplitudes.
 
-    The weakest tone is compared with the strongest that white noise of the residual's size would seem to have: each of
-    the N/2 ordinates of the periodogram of white noise of variance s^2 exceeds ``N A^2/4 = g s^2`` with the probability
+    The weakest tone is compared with the strongest apparent one in white noise of the residual's size: each of the N/2
+    ordinates of the periodogram of white noise of variance s^2 exceeds ``N A^2/4 = g s^2`` with the probability
     ``exp(-g)``, the largest with ``N/2 exp(-g)`` (R. A. Fisher, "Tests of significance in harmonic analysis", *Proc.
     Royal Society A* 125 (1929) 54-59, for many samples).
     """
