@@ -240,5 +240,6 @@ if __name__ == "__main__":
         campaign(given)
         raise SystemExit
     six_loops(given.runs, given.samples, given.seed)
-    paper_loop(given.paper, given.seed, False)
-    paper_loop(given.unknown, given.seed, True)
+    for count, coloured in ((given.paper, False), (given.unknown, True)):
+        if count:
+            paper_loop(count, given.seed, coloured)
