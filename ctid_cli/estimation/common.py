@@ -163,7 +163,7 @@ class Estimator(Generic[LaidOut, AnyFit]):
         """
         records = as_records(record)
         for one in records if not hasattr(self, "inputs") else ():
-            one.input  # noqa: B018 - raises for several inputs
+            one.require_one_input()
         in_loop = any(one.in_loop for one in records) and getattr(self, "instruments", "open_loop") == "open_loop"
         return Prepared(self, self._lay_out(record), in_loop)
 

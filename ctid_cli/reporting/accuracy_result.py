@@ -8,10 +8,11 @@ from typing import Any
 
 import pandas as pd
 
+from ctid_cli.inference.monte_carlo_tests import FEWEST
 from ctid_cli.reporting.document import Result, Section, aligned_lines
 from ctid_cli.reporting.layout import setting_text, setting_title
 from ctid_cli.reporting.results import Results
-from ctid_cli.reporting.surprises import FEWEST, surprises
+from ctid_cli.reporting.surprises import surprises
 from ctid_cli.running.plan import Plan
 from ctid_cli.running.theory import expectations
 from ctid_cli.text import count, listed

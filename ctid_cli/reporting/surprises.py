@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ctid_cli.inference.monte_carlo import Measured
-from ctid_cli.inference.monte_carlo_tests import FEWEST as FEWEST
 from ctid_cli.inference.monte_carlo_tests import MEASURED, Departure, departures
 from ctid_cli.inference.paired import holm
 from ctid_cli.reporting.layout import delay_label, setting_text, setting_title

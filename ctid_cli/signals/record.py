@@ -217,12 +217,16 @@ class Record:
         DataError
             If there are several inputs.
         """
+        self.require_one_input()
+        return next(iter(self.held.values()))
+
+    def require_one_input(self) -> None:
+        """Raise a DataError if there are several inputs."""
         if self.several:
             raise DataError(
                 f"{named(self)}the record has the inputs {', '.join(self.held)}, and this is available for one input "
                 "only; give one"
             )
-        return next(iter(self.held.values()))
 
     @property
     def hold(self) -> Holds:
