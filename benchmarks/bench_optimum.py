@@ -360,7 +360,7 @@ def two_inputs_compared(number, rng, count):
     own = tuple(InputModel(name, poles=m.order) for name, m in zip(record.held, models, strict=True))
     prepared = DelayProfile(max(m.order for m in models), 0, (0.0, 2.0), inputs=own).prepare(record)
     spent, fit = cpu(prepared.fit)
-    problem, bounds = prepared.laid_out.problem, prepared.laid_out.treatment.delay_bounds
+    problem = prepared.laid_out.problem
     starts = [(np.concatenate([m.poles for m in models]), [m.delay for m in models])]
     for _ in range(count):
         poles = [random_poles(rng, m.order, fit.box.spread[0], fit.box.fastest, fit.box.spread[1]) for m in models]
