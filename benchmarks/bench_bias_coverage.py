@@ -27,8 +27,8 @@ from ctid_cli import (
     TransferFunction,
     simulate,
 )
-from ctid_cli.estimators.delay_profile import MeasuredFit, fitted
 from ctid_cli.estimators.frequency_domain import fit_of
+from ctid_cli.estimators.measured_fit import MeasuredFit, fitted
 
 #: Frequency responses: model, degrees, integrators and sampling interval; 0 for G(jw).
 RESPONSES = {

@@ -52,7 +52,7 @@ from .inference.fitted_model import FittedModel as FittedModel
 from .inference.model_responses import FrequencyBand as FrequencyBand, PoleBand as PoleBand
 from .inference.model_responses import ResponseBand as ResponseBand
 from .estimators.additive_srivc import AdditiveFit as AdditiveFit
-from .estimators.delay_profile import MeasuredFit as MeasuredFit, MultiInputFit as MultiInputFit
+from .estimators.measured_fit import MeasuredFit as MeasuredFit, MultiInputFit as MultiInputFit
 from .estimators.loop_output_error import LoopFit as LoopFit
 from .estimators.measured_submodels import SubmodelsFit as SubmodelsFit
 from .estimators.frequency_domain import FrequencyDomainFit as FrequencyDomainFit

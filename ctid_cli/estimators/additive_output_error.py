@@ -16,13 +16,8 @@ from ctid_cli.estimation.optimum.best_model import Begin, poles_of_submodels
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.parameter_layout import SumDegrees
 from ctid_cli.estimators.additive_srivc import check_submodels, check_terms
-from ctid_cli.estimators.delay_profile import (
-    MeasuredFit,
-    RecordsEstimator,
-    check_clocks,
-    check_positive,
-    check_treatment,
-)
+from ctid_cli.estimators.delay_profile import RecordsEstimator, check_clocks, check_positive, check_treatment
+from ctid_cli.estimators.measured_fit import MeasuredFit
 from ctid_cli.estimators.measured_submodels import SubmodelsFit, sampling_margin
 from ctid_cli.inference.sensitivities import SumStructure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance

@@ -1,268 +1,35 @@
 """Global estimation from measured records: one-dimensional search over the delay, then output-error minimisation."""
 
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any, ClassVar, NamedTuple, Self
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.errors import DataError, OptionError, UsageError
-from ctid_cli.estimation.common import Bound, Estimator, Fixed, Start, checked_bounds, places_of, quality
+from ctid_cli.arrays import Array
+from ctid_cli.errors import DataError, OptionError
+from ctid_cli.estimation.common import Bound, Estimator, Fixed, Start, checked_bounds, places_of
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, Treatment, sensitivities
-from ctid_cli.estimation.noise_search import joint_optimum
-from ctid_cli.estimation.optimum.best_model import Begin, Optimum
-from ctid_cli.estimation.optimum.box import Box
+from ctid_cli.estimation.optimum.best_model import Begin
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.parameter_bounds import BoundedSearch, Quantity, quantities_of
-from ctid_cli.estimation.parameter_layout import Degrees, Layout
+from ctid_cli.estimation.parameter_layout import Degrees
 from ctid_cli.estimation.profile_search import Profile, search_delay
-from ctid_cli.estimation.robust_fit import RobustFit, robust_fit, robust_local
-from ctid_cli.filtering.bank import Equations
-from ctid_cli.inference.criteria import percent_from_r_squared
-from ctid_cli.inference.fit import DeferredFields, Fit, InputFit, Status
-from ctid_cli.inference.model_responses import Estimated
-from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_covariance, orders_of
-from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
-from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
-from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of, is_delay
-from ctid_cli.signals.noise import ArmaNoise
+from ctid_cli.estimation.robust_fit import robust_fit, robust_local
+from ctid_cli.estimators.measured_fit import (
+    FittedSamples,
+    MeasuredFit,
+    Met,
+    MultiInputFit,
+    fitted,
+    samples_at,
+    with_noise,
+)
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.uncertainty import DRAWS, Covariance
+from ctid_cli.models.several_inputs import delays_of, is_delay
 from ctid_cli.signals.record import Record, as_records, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offset, OutputHold
-
-
-class Starts(NamedTuple):
-    """Number of local searches, and number that agree with the best of them."""
-
-    tried: int
-    agree: int
-
-
-class Met(NamedTuple):
-    """Parameter at a given bound."""
-
-    name: str
-    end: float
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MeasuredFit(DeferredFields, Fit):
-    """Fit with data of its records.
-
-    Parameters
-    ----------
-    model, parameter_names, covariance, status, r2, count, condition_number, law, in_ignored_loop
-        As in :class:`~ctid_cli.inference.fit.Fit`.
-    cost : float
-        Mean squared output error over the used samples, or twice the mean of another loss [output unit^2].
-    fit_percent : float
-        ``100 (1 - ||y - x|| / ||y - mean y||)`` over the used samples of all experiments, means by experiment [%].
-    iterations : int
-        Evaluations of the cost and of its gradient in the refinement.
-    history : tuple of IterationRecord
-        Empty.
-    theta : ndarray, shape (p,)
-        All free parameters, in the order of ``parameter_names``.
-    initial_states : tuple of ndarray
-        Coefficients of C for each experiment; empty arrays if the state was not estimated.
-    offsets : tuple of float
-        Output offset of each experiment [output unit]; the subtracted mean if means were removed.
-    input_offsets : tuple of float
-        Subtracted mean of the input [input unit]; 0 without.
-    profile : Profile or None
-        Search over the delay; None for a known delay.
-    residuals : tuple of ndarray
-        Output errors at the used samples of each experiment [output unit].
-    sensitivities : tuple of ndarray
-        psi at the used samples of each experiment, shape (count, p).
-    used : tuple of ndarray of bool
-        Mask of the used samples of each record, shape (N,).
-    starts : Starts or None
-        Number of local searches, and number that reached the estimate.
-    poles_at_infinity : int
-        Number of requested poles at infinity, by which the model has fewer poles.
-    box : Box or None
-        Set of admissible models.
-    weighting : Weighting or None
-        Weights of the samples, if the loss is not that of squares.
-    held_poles : tuple of complex
-        Poles at a bound of that set [rad/s], treated as known in the standard errors.
-    tangent : ndarray, shape (p, f)
-        Free directions of the parameters: columns of the identity unless poles or the delay are at a bound.
-    known : tuple of str
-        Names of the fixed parameters.
-    noise : NoiseEstimate or None
-        Noise model estimated with the plant; None for an output-error fit.
-    bounds_met : tuple of Met
-        Parameters at a given bound, and these bounds.
-    """
-
-    deferred: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
-
-    theta: Array = field(default_factory=lambda: np.zeros(0))
-    initial_states: tuple[Array, ...] = ()
-    offsets: tuple[float, ...] = ()
-    input_offsets: tuple[float, ...] = ()
-    profile: Profile | None = None
-    residuals: tuple[Array, ...] = field(default_factory=tuple)
-    sensitivities: tuple[Array, ...] = field(default_factory=tuple)
-    used: tuple[BoolArray, ...] = field(default_factory=tuple)
-    starts: Starts | None = None
-    poles_at_infinity: int = 0
-    box: Box | None = None
-    weighting: Weighting | None = None
-    held_poles: tuple[complex, ...] = ()
-    tangent: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    known: tuple[str, ...] = ()
-    noise: NoiseEstimate | None = None
-    bounds_met: tuple[Met, ...] = ()
-
-    def uncertainty(
-        self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
-    ) -> Uncertainty:
-        """Return standard errors and intervals for a kind of noise.
-
-        Parameters
-        ----------
-        kind : {"auto", "white", "robust", "bootstrap"}, default "auto"
-            Assumed noise; ``auto`` is white unless the residuals are not.
-        draws : int, default 500
-            Number of simulated noise sequences of a bootstrap [-].
-        progress : callable, optional
-            Called after each sequence with the numbers of completed and of all sequences.
-
-        Returns
-        -------
-        Uncertainty
-            Covariance, and quantiles of the intervals.
-        """
-        linear = self.linear
-        found = estimate_uncertainty(
-            linear.sensitivities, linear.residuals, kind, draws, tangent=self.tangent, progress=progress
-        )
-        return found.in_ignored_loop if self.in_ignored_loop and kind == "auto" else found
-
-    def _with_uncertainty(self, kind: Covariance, draws: int) -> Self:
-        """Return the fit with errors for a kind of noise; singular if it converged but has no covariance."""
-        law = self.uncertainty(kind, draws)
-        singular = self.status is Status.CONVERGED and not np.isfinite(law.free_covariance).all()
-        return replace(self, covariance=law.covariance, law=law, status=Status.SINGULAR if singular else self.status)
-
-    @property
-    def signs_known(self) -> bool:
-        """Whether no coefficient of the denominator can be zero, which is true for stable plants."""
-        return not (self.model.poles.real > 0).any()
-
-    @property
-    def linear(self) -> "MeasuredFit":
-        """Least-squares fit with the same distribution: itself, or with pseudo-errors of its loss, or innovations."""
-        if self.noise is not None:
-            return self._of_innovations
-        if self.weighting is None:
-            return self
-        law = FittedSamples(self.residuals, self.sensitivities, self.used, self.weighting).linear
-        count = sum(eps.size for eps in law.residuals)
-        cost = sum(float(eps @ eps) for eps in law.residuals) / count
-        return replace(self, **law._asdict(), count=count, cost=cost)
-
-    @property
-    def arma(self) -> ArmaNoise | None:
-        """Noise model estimated with the plant."""
-        return None if self.noise is None else self.noise.noise
-
-    @cached_property
-    def _of_innovations(self) -> "MeasuredFit":
-        assert self.noise is not None
-        psi, innovations = self.noise.whitened(self.sensitivities, self.residuals, self.used)
-        cost = sum(float(e @ e) for e in innovations) / self.count
-        return replace(self, sensitivities=psi, residuals=innovations, cost=cost, noise=None)
-
-    @property
-    def left_over(self) -> str:
-        """Name of the tested sequence."""
-        return "residuals" if self.noise is None else "innovations"
-
-    def prediction_fit(self, ahead: int) -> float:
-        """Return the fit of predictions of the outputs; without a noise model that of simulated outputs.
-
-        Parameters
-        ----------
-        ahead : int
-            Prediction horizon in samples [-].
-
-        Returns
-        -------
-        float
-            ``100 (1 - ||y - p|| / ||y - mean y||)`` of the predictions p [%].
-        """
-        if self.noise is None:
-            return self.fit_percent
-        errors = self.noise.prediction_errors(self.residuals, self.used, ahead)
-        mean_square = sum(float(e @ e) for e in errors) / self.count
-        simulated = sum(float(e @ e) for e in self.residuals) / self.count
-        return percent_from_r_squared(1.0 - (1.0 - self.r2) * mean_square / simulated)
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """Free parameters by name."""
-        return dict(zip(self.parameter_names, self.theta.tolist(), strict=True))
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MultiInputFit(MeasuredFit):
-    """Fit to records with several inputs, with one transfer function for each.
-
-    Parameters
-    ----------
-    model : MultiInputModel
-        Transfer functions of the inputs.
-    parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number, history, law
-        As in :class:`MeasuredFit`.
-    in_ignored_loop, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
-        As in :class:`MeasuredFit`; ``input_offsets`` has those of all inputs, record by record.
-    poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
-        As in :class:`MeasuredFit`.
-    """
-
-    model: MultiInputModel  # type: ignore[assignment]  # callers that need one transfer function use that of an input
-
-    @property
-    def coefficients(self) -> dict[str, float]:
-        """Coefficients and delays by name, including known delays."""
-        known = {f"{name}_delay": part.delay for name, part in self.model.parts.items()}
-        return {n: v for n, v in self.parameters.items() if re.fullmatch(r"(.+_)?[ab]\d+", n)} | {
-            n: self.parameters.get(n, v) for n, v in known.items()
-        }
-
-    def of_input(self, name: str) -> InputFit:
-        """Return the transfer function of an input, with its responses.
-
-        Parameters
-        ----------
-        name : str
-            Name of the input.
-
-        Returns
-        -------
-        InputFit
-            The model from this input to the output.
-
-        Raises
-        ------
-        DataError
-            If the input does not exist.
-        """
-        if name not in self.model.parts:
-            raise DataError(f"there is no input {name!r}; there are {', '.join(self.model.parts)}")
-        law = self.law or Uncertainty.known(self.covariance)
-        return InputFit.of(name, self.model.parts[name], self.parameter_names, law)
-
-    def _estimated(self) -> Estimated:
-        """Raise an error, since there is no single transfer function."""
-        inputs = ", ".join(self.model.parts)
-        raise UsageError(f"the model has the inputs {inputs}; take one of them, such as fit.of_input(NAME)")
 
 
 def _within(bounds: tuple[float, float] | None, delays: tuple[float, float]) -> tuple[float, float]:
@@ -274,28 +41,6 @@ def _within(bounds: tuple[float, float] | None, delays: tuple[float, float]) -> 
         given = f"{bounds[0]:g} to {bounds[1]:g} s and delay_bounds {delays[0]:g} to {delays[1]:g} s"
         raise OptionError("bounds", f"no delay is within its bounds, {given}; give one of them")
     return low, high
-
-
-class FittedSamples(NamedTuple):
-    """Signals of a fit at each used sample of each record."""
-
-    residuals: tuple[Array, ...]
-    sensitivities: tuple[Array, ...]
-    used: tuple[BoolArray, ...]
-    weighting: Weighting | None
-
-    @property
-    def linear(self) -> "FittedSamples":
-        """Least squares with the same distribution: pseudo-errors, with samples of zero weight as missing."""
-        if self.weighting is None:
-            return self
-        kept = [weights > 0.0 for weights in self.weighting.weights]
-        left = [use.copy() for use in self.used]
-        for use, keep in zip(left, kept, strict=True):
-            use[use] = keep
-        errors = tuple(e[keep] for e, keep in zip(self.weighting.pseudo_errors, kept, strict=True))
-        slopes = tuple(psi[keep] for psi, keep in zip(self.sensitivities, kept, strict=True))
-        return FittedSamples(errors, slopes, tuple(left), None)
 
 
 class RecordsEstimator(Estimator[MeasuredRecords, MeasuredFit]):
@@ -655,125 +400,6 @@ class DelayProfile(RecordsEstimator):
             return fitted(measured, found, None, None)
         robust = robust_local(measured, self.loss, found)
         return fitted(measured, robust.found, None, robust)
-
-
-def fitted(
-    measured: MeasuredRecords,
-    found: Optimum,
-    profile: Profile | None,
-    robust: RobustFit | None,
-) -> MeasuredFit:
-    """Return the result of a refinement, without its covariance."""
-    layout, theta = measured.parameters(found)
-    model = measured.model(found)
-    samples = samples_at(measured, model, theta, None if robust is None else robust.losses)
-    residuals, law = samples.residuals, samples.linear
-    hessian = np.sum([psi.T @ psi for psi in law.sensitivities], axis=0)
-    each = zip(law.sensitivities, law.residuals, strict=True)
-    gradient = np.sum([psi.T @ eps for psi, eps in each], axis=0)
-    equations = Equations(hessian, gradient, hessian, sum(float(eps @ eps) for eps in residuals), 0.0)
-    count = sum(eps.size for eps in residuals)
-    values = quality(equations, measured.spread, count)
-    if robust is not None:
-        values["cost"] = robust.cost(robust.losses) / count
-    states, offsets = measured.own(layout, theta)
-    given = _given(layout, measured)
-    kind: Any = MultiInputFit if isinstance(model, MultiInputModel) else MeasuredFit
-    fit: MeasuredFit = kind(
-        model=model,
-        parameter_names=layout.names,
-        covariance=np.full((layout.size, layout.size), np.nan),
-        status=Status.DELAY_AT_BOUND if found.delays_at_bound else Status[found.ending.name],
-        iterations=found.evaluations,
-        theta=theta,
-        initial_states=states,
-        offsets=offsets,
-        input_offsets=tuple(measured.input_offsets),
-        profile=profile,
-        residuals=residuals,
-        sensitivities=samples.sensitivities,
-        used=samples.used,
-        starts=Starts(found.tried, found.agree),
-        poles_at_infinity=found.poles_at_infinity,
-        box=found.box,
-        weighting=samples.weighting,
-        held_poles=tuple(found.held_poles.tolist()),
-        tangent=_tangent(layout, found, given),
-        known=tuple(np.array(layout.names)[given].tolist()),
-        **values,
-    )
-    return fit
-
-
-def with_noise(
-    measured: MeasuredRecords,
-    beside: MeasuredFit,
-    found: Optimum,
-    noise_model: str,
-    starts: Sequence[Begin],
-    *,
-    nested: bool = False,
-) -> MeasuredFit:
-    """Return the maximum-likelihood fit of plant and noise, with an output-error fit for comparison."""
-    joint = joint_optimum(measured, found, orders_of(noise_model), starts, nested=nested)
-    fit = fitted(measured, replace(joint.found, tried=found.tried, agree=found.agree), beside.profile, None)
-    law = beside.uncertainty("robust")
-    robust = law.covariance
-    with np.errstate(invalid="ignore"):
-        errors = np.sqrt(np.diag(robust))
-    estimate = NoiseEstimate(
-        noise=joint.noise.noise,
-        covariance=noise_covariance(joint.noise, fit.residuals, fit.used),
-        deviance=joint.noise.deviance,
-        chosen=noise_model == "auto",
-        output_error=beside.theta,
-        output_error_errors=errors,
-        output_error_fit=beside.fit_percent,
-    )
-    fit = replace(fit, noise=estimate)
-    efficient = fit.uncertainty("white").covariance
-    shared = measured.layout_of(fit.model).degrees.size
-    own = (np.arange(fit.theta.size) < shared) & (errors > 0) & (np.diag(efficient) > 0)
-    pair = robust[np.ix_(own, own)], efficient[np.ix_(own, own)]
-    test = hausman((beside.theta - fit.theta)[own], *pair, law.degrees_of_freedom)
-    return replace(fit, noise=replace(estimate, test=test))
-
-
-def samples_at(
-    measured: MeasuredRecords, model: AnyModel, theta: Array, losses: Sequence[Loss] | None
-) -> FittedSamples:
-    """Return the signals of an estimate at the used samples; the default loss is that of squares."""
-    layout = measured.layout_of(model)
-    psi, errors = zip(*sensitivities(measured.problem, layout, theta, delays_of(model)), strict=True)
-    used = measured.used()
-    if losses is None:
-        return FittedSamples(errors, psi, used, None)
-    # Sensitivities are computed with interpolated outliers; the errors here are from measured outputs.
-    each = zip(measured.outputs, measured.problem.records, errors, strict=True)
-    errors = tuple(y - (data.y_used - eps) for y, data, eps in each)
-    return FittedSamples(errors, psi, used, weighted(losses, errors, layout.size))
-
-
-def _given(layout: Layout, measured: MeasuredRecords) -> BoolArray:
-    """Return the mask of known parameters."""
-    fixed = np.zeros(layout.size, dtype=bool)
-    # Poles at infinity are missing among the first coefficients.
-    given = measured.given[measured.degrees.poles - layout.degrees.poles :]
-    fixed[: given.size] = given
-    return fixed
-
-
-def _tangent(layout: Layout, found: Optimum, fixed: BoolArray) -> Array:
-    """Return the directions that preserve known parameters and keep poles and delays in the admissible set."""
-    degrees, fixed = layout.degrees, fixed.copy()
-    for k in found.delays_at_bound:
-        fixed[degrees.delay(k)] = True
-    if not found.held_poles.size:
-        return np.eye(layout.size)[:, ~fixed]
-    moving = np.zeros((layout.size, found.pole_slopes.shape[1]))
-    moving[degrees.denominators] = found.pole_slopes
-    fixed[degrees.denominators] = True
-    return np.column_stack((moving, np.eye(layout.size)[:, ~fixed]))
 
 
 def check_treatment(options: RecordsEstimator) -> None:

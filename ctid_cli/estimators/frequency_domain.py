@@ -15,7 +15,8 @@ from ctid_cli.estimation.measured_lines import MeasuredLines
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
-from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, fitted, samples_at
+from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.measured_fit import MeasuredFit, fitted, samples_at
 from ctid_cli.inference.covariance import robust_covariance, sandwich, unit_inverse
 from ctid_cli.inference.residual_tests import all_white, chi_square_tail, normal_tail
 from ctid_cli.inference.sensitivities import Structure
@@ -37,13 +38,13 @@ class FrequencyDomainFit(MeasuredFit):
     Parameters
     ----------
     model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number
-        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`; a sample is a weighted real or imaginary part,
+        As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`; a sample is a weighted real or imaginary part,
         and means are not subtracted in ``fit_percent`` and ``r2``.
     history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
-        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`; ``used`` refers to the real parts of all lines,
+        As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`; ``used`` refers to the real parts of all lines,
         then the imaginary parts.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
-        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
+        As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     data : FrequencyData
         Frequency response.
     """

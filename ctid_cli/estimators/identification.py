@@ -1,31 +1,34 @@
 """Fit to measured records with its uncertainty and diagnostics."""
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray, IndexArray
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords
-from ctid_cli.estimation.optimum.box import each_bounds
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
-from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, MultiInputFit
+from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.frequency_domain import FrequencyDomain, FrequencyDomainFit
 from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopFit, LoopOutputError
+from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
 from ctid_cli.estimators.measured_submodels import LaidOutSubmodels, MeasuredSubmodels, SubmodelsFit
+from ctid_cli.estimators.reported_parameters import (
+    LEVEL,
+    cost_of_delay,
+    free_directions,
+    reported_parameters,
+    uncertainty_of_data,
+)
 from ctid_cli.estimators.rivc import Rivc
 from ctid_cli.inference import criteria as criteria_of
-from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.criteria import fit_percent, r_squared
-from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.fit import DeferredFields, InputFit
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.innovations import sampled
-from ctid_cli.inference.intervals import BIASED, CostOfDelay, DelayInterval, UncertainValue
+from ctid_cli.inference.intervals import BIASED, DelayInterval, UncertainValue
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
@@ -40,8 +43,6 @@ from ctid_cli.text import Shown
 #: Estimators of measured records, and their prepared records.
 Options = DelayProfile | Rivc | AdditiveOutputError | MeasuredSubmodels | LoopOutputError | FrequencyDomain
 LaidOut = MeasuredRecords | LaidOutSubmodels | LaidOutLoop
-#: Confidence level of intervals and tests.
-LEVEL = 0.95
 #: Plot of the cost: number of delays about the estimate, and half-range in half-widths of the interval.
 DRAWN_DELAYS, DRAWN_INTERVALS = 24, 2.5
 
@@ -301,63 +302,24 @@ def identify(
     if fit.noise is not None:
         squared_error, size = fit.count * np.exp(fit.noise.deviance / fit.count), size + sum(fit.noise.orders)
     tests = tests_of(options, linear, records)
-    told = parameters_told(fit, uncertainty, answer.seen, laid_out)
-    free, matrix = free_directions(linear)[0], _of_data(fit, uncertainty).covariance
-    judged = None
+    reported = reported_parameters(fit, uncertainty, answer.seen, laid_out)
+    free, matrix = free_directions(linear)[0], uncertainty_of_data(fit, uncertainty).covariance
+    validated_on = None
     if checked is not None and validation is not None:
-        judged = validated(options._applied(fit, checked), validation)
+        validated_on = validated(options._applied(fit, checked), validation)
     return Identification(
         options=replace(options, covariance=covariance, bootstrap_draws=bootstrap_draws),
         fit=fit,
         answer=answer,
-        **told._asdict(),
+        **reported._asdict(),
         tests=tests,
         criteria=criteria_of.information_criteria(squared_error, fit.count, size),
         yic=criteria_of.young_information_criterion(residuals, output, fit.theta[free], matrix[np.ix_(free, free)]),
         r_t_squared=criteria_of.r_t_squared(residuals, output),
         warnings=(),
-        validation=judged,
+        validation=validated_on,
         records=tuple(records),
     )
-
-
-class Told(NamedTuple):
-    """Reported parameters."""
-
-    estimates: tuple[UncertainValue, ...]
-    delay_interval: DelayInterval | None
-    derived: tuple[UncertainValue, ...]
-
-
-def parameters_told(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool, laid_out: Any) -> Told:
-    """Return parameters and derived quantities, with their uncertainty if it exists and a response is detected."""
-    biased, linear = uncertainty.kind == "biased", fit.linear
-    free, hessian = free_directions(linear)
-    singular = not condition_number(hessian) <= NEARLY_SINGULAR
-    unclear = {
-        fit.parameter_names[k]
-        for k in (free if singular else _undetermined(fit, _of_data(fit, uncertainty).covariance))
-    }
-    if not seen:
-        unclear |= {name for name in fit.parameter_names if not name.startswith("offset")}
-    intervals: dict[str, DelayInterval] = {}
-    for name in delay_names(fit):
-        if isinstance(laid_out, MeasuredRecords) and not biased and name in {*fit.parameter_names} - unclear:
-            interval = _delay_interval(laid_out, linear, uncertainty, name)
-            intervals |= {} if interval is None else {name: interval}
-    return Told(
-        _estimates(fit, uncertainty, unclear, intervals),
-        next(iter(intervals.values()), None),
-        _derived(fit, uncertainty, seen and not singular),
-    )
-
-
-def _of_data(fit: MeasuredFit, uncertainty: Uncertainty) -> Uncertainty:
-    """Return the uncertainty due to the data, which exists even without standard errors."""
-    return fit.uncertainty("white") if uncertainty.kind == "biased" else uncertainty
-
-
-# --- residuals and uncertainty ----------------------------------------------------------------------
 
 
 def tests_of(options: Options, fit: MeasuredFit, records: Sequence[Record]) -> tuple[ResidualTests, ...]:
@@ -392,29 +354,6 @@ def answer_of(options: Options, records: Sequence[Record], used: Sequence[BoolAr
     return replace(best, p_value=min(1.0, len(names) * best.p_value))
 
 
-def delay_names(fit: MeasuredFit) -> list[str]:
-    """Return the names of the delays of all inputs."""
-    return [f"{name}_delay" for name in fit.model.parts] if isinstance(fit, MultiInputFit) else ["delay"]
-
-
-def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
-    """Return the parameters that the data do not determine, for which no standard error is reported.
-
-    These are coefficients or delays with a standard error above ten times their size, and parameters correlated with
-    them.
-    """
-    names, errors = fit.parameter_names, np.sqrt(np.diag(covariance))
-    looked_at = np.array([re.fullmatch(r"(.*_)?([ab]\d+|delay)", name) is not None for name in names])
-    if not fit.signs_known:
-        looked_at &= np.array(["a" not in name for name in names])
-    unclear = ~np.isfinite(errors) | (looked_at & (errors > LARGE_STANDARD_ERROR * np.abs(fit.theta)))
-    unclear[~fit.tangent.any(axis=1)] = False
-    with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = np.abs(covariance / np.outer(errors, errors))
-    moving = (correlation[unclear] > CLOSE_TO_ONE).any(axis=0)
-    return set(np.flatnonzero(unclear | moving).tolist())
-
-
 def unsafe_intervals(found: Identification) -> list[str]:
     """Return the parameters with intervals beyond the range in which the output is linear in them."""
     fit, options = found.fit, found.options
@@ -426,48 +365,6 @@ def unsafe_intervals(found: Identification) -> list[str]:
     noises = () if fit.arma is None else sampled(fit.arma, fit.used)
     shifts = shifts_of_ends(model, found.uncertainty, records, linear.used, linear.sensitivities, noises)
     return [name for name, shift in zip(fit.parameter_names, shifts, strict=True) if name in shown and shift > UNSAFE]
-
-
-def free_directions(fit: MeasuredFit) -> tuple[IndexArray, Array]:
-    """Return the indices of the parameters that are not at a bound, and ``sum psi psi'`` along the free directions."""
-    hessian = sum((psi.T @ psi for psi in fit.sensitivities), np.zeros((fit.theta.size, fit.theta.size)))
-    return np.flatnonzero(fit.tangent.any(axis=1)), fit.tangent.T @ hessian @ fit.tangent
-
-
-# --- the delay -------------------------------------------------------------------------------------
-
-
-def _delay_interval(
-    measured: MeasuredRecords, fit: MeasuredFit, uncertainty: Uncertainty, name: str
-) -> DelayInterval | None:
-    """Return the profile-likelihood interval of a free delay; None if the quadratic interval is adequate."""
-    profile, reach, error = _cost_of_delay(measured, fit, uncertainty, name)
-    return profile.interval(reach) if profile.quadratic_is_doubtful(error) else None
-
-
-def _cost_of_delay(
-    measured: MeasuredRecords, fit: MeasuredFit, uncertainty: Uncertainty, name: str = "delay"
-) -> tuple[CostOfDelay, float, float]:
-    """Return the cost about a delay, the quantile of its interval, and its standard error."""
-    place, k = fit.parameter_names.index(name), delay_names(fit).index(name)
-    held = not fit.tangent[place].any()
-    if held:
-        # The effect of the noise on a delay at a bound is that of a free one.
-        fit = replace(fit, tangent=np.column_stack((fit.tangent, np.eye(fit.theta.size)[place])))
-        uncertainty = fit.uncertainty("white" if uncertainty.kind == "white" else "robust")
-    variance = float(uncertainty.covariance[place, place])
-    white = float(fit.uncertainty("white").covariance[place, place])
-    profile = CostOfDelay(
-        cache(lambda trial: measured.squared_error_at(fit.parametrised, trial, k)),
-        float(fit.theta[place]),
-        fit.cost * fit.count,
-        fit.count,
-        fit.theta.size - len(fit.known),
-        each_bounds(measured.treatment.delay_bounds)[k],
-        max(variance / white, np.finfo(float).tiny),
-    )
-    reach = uncertainty.quantile(np.eye(fit.theta.size)[place], LEVEL)
-    return profile, reach, float("nan") if held else float(np.sqrt(variance))
 
 
 class DelayCosts(NamedTuple):
@@ -494,7 +391,7 @@ def costs_about_delay(result: Identification) -> DelayCosts | None:
     laid_out = result.options.prepare(result.records).laid_out
     if not isinstance(laid_out, MeasuredRecords):
         return None
-    profile, reach, _ = _cost_of_delay(
+    profile, reach, _ = cost_of_delay(
         laid_out.near(result.fit.residuals, result.fit.weighting, result.fit.arma),
         fit,
         result.uncertainty,
@@ -506,83 +403,12 @@ def costs_about_delay(result: Identification) -> DelayCosts | None:
     return DelayCosts(delays, costs, fit.cost, fit.cost * (1.0 + profile.allowed(reach)))
 
 
-# --- results ---------------------------------------------------------------------------------------
-
-
-def _estimates(
-    fit: MeasuredFit, uncertainty: Uncertainty, unclear: set[str], intervals: Mapping[str, DelayInterval]
-) -> tuple[UncertainValue, ...]:
-    """Return the parameters: numerator, denominator, delay, then those of the experiments."""
-    found: dict[str, UncertainValue] = {}
-    with np.errstate(invalid="ignore"):
-        errors = np.sqrt(np.diag(uncertainty.covariance))
-    free = set(free_directions(fit)[0].tolist())
-    for k, (name, value) in enumerate(zip(fit.parameter_names, fit.theta.tolist(), strict=True)):
-        if name in unclear:
-            found[name] = UncertainValue(name, value, status="undetermined")
-        elif k in free:
-            reach = uncertainty.quantile(np.eye(errors.size)[k], LEVEL)
-            reason = BIASED if uncertainty.kind == "biased" else ""
-            found[name] = UncertainValue.symmetric(name, value, float(errors[k]), quantile=reach, reason=reason)
-        else:
-            found[name] = UncertainValue(name, value, status="fixed" if name in fit.known else "at bound")
-        if name in intervals:
-            found[name] = replace(found[name], low=intervals[name].low, high=intervals[name].high)
-    for name, delay in zip(delay_names(fit), delays_of(fit.model), strict=True):
-        found.setdefault(name, UncertainValue(name, delay, status="fixed"))
-    order = {"b": 0, "a": 1, "g": 1, "d": 2}
-    inputs = list(fit.model.parts) if isinstance(fit, MultiInputFit) else []
-
-    def place(item: UncertainValue) -> tuple[int, int]:
-        # Parameters are grouped by input, followed by common ones.
-        own = next((k for k, name in enumerate(inputs) if item.name.startswith(f"{name}_")), len(inputs))
-        kind = item.name.removeprefix(f"{inputs[own]}_") if own < len(inputs) else item.name
-        return own, order.get(kind[0], 3)
-
-    return tuple(sorted(found.values(), key=place))
-
-
 def laid_out_validation(options: Options, validation: Record) -> LaidOut:
     """Return a prepared validation record."""
     try:
         return options.prepare(validation).laid_out
     except DataError as error:
         raise DataError(f"validation record: {error}") from None
-
-
-def _derived(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool) -> tuple[UncertainValue, ...]:
-    """Return poles, time constants, frequencies, damping and gain; without errors if no response is detected."""
-    covariance = uncertainty.covariance if seen else np.full_like(uncertainty.covariance, np.nan)
-    # Known parameters have no variance.
-    known = np.isin(fit.parameter_names, fit.known)
-    covariance[known] = covariance[:, known] = 0.0
-    if isinstance(fit, SubmodelsFit) and fit.additive is not None:
-        return derived_parameters(fit.additive, covariance, uncertainty.quantile)
-    if isinstance(fit, MultiInputFit):
-        return _derived_of_inputs(fit, covariance, uncertainty)
-    size = fit.model.denominator.size + sum(name.startswith("b") for name in fit.parameter_names) - 1
-    held = fit.tangent[:size] if fit.held_poles or fit.bounds_met else None
-    return derived_parameters(fit.model, covariance[:size, :size], uncertainty.quantile, held)
-
-
-def _derived_of_inputs(fit: MultiInputFit, covariance: Array, uncertainty: Uncertainty) -> tuple[UncertainValue, ...]:
-    """Return derived quantities of the transfer function of each input; those of a common denominator once."""
-    found: list[UncertainValue] = []
-    for k, (name, model) in enumerate(fit.model.parts.items()):
-        names = fit.of_input(name).parameter_names
-        own = [i for kind in "ab" for i, each in enumerate(names) if each.startswith(kind)]
-
-        def quantile(gradient: Array, own: Sequence[int] = own) -> float:
-            whole = np.zeros(len(covariance))
-            whole[own[: gradient.size]] = gradient
-            return uncertainty.quantile(whole)
-
-        held = fit.tangent[own] if fit.held_poles or fit.bounds_met else None
-        values = derived_parameters(model, covariance[np.ix_(own, own)], quantile, held)
-        shared = [] if not fit.model.common else [item for item in values if item.name != "static_gain"]
-        found += shared if k == 0 else []
-        found += [replace(item, name=f"{name}_{item.name}") for item in values if item not in shared]
-    return tuple(found)
 
 
 def models_of(found: Identification) -> dict[str, FittedModel]:

@@ -21,7 +21,7 @@ from ctid_cli.estimation.common import (
 )
 from ctid_cli.estimation.loop_problem import LoopEstimate, LoopProblem
 from ctid_cli.estimation.measured_records import AppliedModel, without_means
-from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit, Starts
+from ctid_cli.estimators.measured_fit import FittedSamples, MeasuredFit, Starts
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.loop import NO_DELAY
@@ -49,11 +49,11 @@ class LoopFit(MeasuredFit):
     Parameters
     ----------
     model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number
-        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
+        As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
-        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
+        As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
-        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
+        As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     loop_radius : float
         Largest magnitude of the poles of the loop with the controller over one sampling interval [-].
     """

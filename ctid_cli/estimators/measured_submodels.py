@@ -14,7 +14,7 @@ from ctid_cli.estimation.additive_problem import Instruments, following
 from ctid_cli.estimation.common import Estimator, Fixed, Start, quality
 from ctid_cli.estimation.measured_records import AppliedModel, without_means
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
-from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit
+from ctid_cli.estimators.measured_fit import FittedSamples, MeasuredFit
 from ctid_cli.filtering.filter_data import used_samples
 from ctid_cli.filtering.submodels import OPEN_LOOP
 from ctid_cli.inference.sensitivities import Structure
@@ -34,11 +34,11 @@ class SubmodelsFit(MeasuredFit):
     Parameters
     ----------
     model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number
-        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
+        As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
-        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
+        As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
-        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
+        As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     additive : AdditiveModel or None
         Submodels; None for a single transfer function.
     start_method : str

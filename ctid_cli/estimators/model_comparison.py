@@ -9,9 +9,9 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, Treatment
-from ctid_cli.estimators.delay_profile import MultiInputFit
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.loop_output_error import LoopOutputError
+from ctid_cli.estimators.measured_fit import MultiInputFit
 from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests

@@ -12,7 +12,8 @@ from ctid_cli.estimation.optimum.best_model import Begin, Optimum, best_near, be
 from ctid_cli.estimation.optimum.box import box_of
 from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
 from ctid_cli.estimators.additive_output_error import GROWN, AdditiveOutputError
-from ctid_cli.estimators.delay_profile import DelayProfile, InputModel, fitted
+from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
+from ctid_cli.estimators.measured_fit import fitted
 from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking, Searched, penalised, ranked
 from ctid_cli.models.additive import Term
 from ctid_cli.models.several_inputs import AnyModel, delays_of

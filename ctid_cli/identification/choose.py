@@ -12,8 +12,9 @@ from typing import Any, get_args
 import numpy as np
 
 from ctid_cli.estimation.common import check_greatest_delay
-from ctid_cli.estimators.delay_profile import DelayProfile, MultiInputFit
+from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import answer_of
+from ctid_cli.estimators.measured_fit import MultiInputFit
 from ctid_cli.identification import sentences
 from ctid_cli.identification.candidates import SMALL, Setting, Several, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given

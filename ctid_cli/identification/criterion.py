@@ -17,7 +17,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
-from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.measured_fit import MeasuredFit
 from ctid_cli.inference.covariance import LARGEST_CONDITION
 from ctid_cli.inference.criteria import (
     InformationCriteria,

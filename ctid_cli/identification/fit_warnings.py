@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctid_cli.arrays import BoolArray
-from ctid_cli.estimators.delay_profile import MeasuredFit, MultiInputFit
-from ctid_cli.estimators.identification import Identification, delay_names, free_directions, unsafe_intervals
+from ctid_cli.estimators.identification import Identification, unsafe_intervals
+from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
+from ctid_cli.estimators.reported_parameters import delay_names, free_directions
 from ctid_cli.identification.remedies import Kind, Remedy, Trials, tried_remedies
 from ctid_cli.inference.covariance import condition_number, describe_conditioning
 from ctid_cli.inference.fit import Status

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from ctid_cli.estimators.frequency_domain import MISFIT, FrequencyDomain, FrequencyDomainFit
-from ctid_cli.estimators.identification import Identification, free_directions, parameters_told
+from ctid_cli.estimators.identification import Identification
+from ctid_cli.estimators.reported_parameters import free_directions, reported_parameters
 from ctid_cli.identification.fit_warnings import LOW_FIT, MOST, of_conditioning, of_lost_poles, of_search
 from ctid_cli.identification.remedies import DECISIVE
 from ctid_cli.inference.criteria import information_criteria, r_t_squared, young_information_criterion
@@ -57,7 +58,7 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain) -
         options=options,
         fit=fit,
         answer=answer,
-        **parameters_told(fit, fit.law, answer.seen, prepared.laid_out)._asdict(),
+        **reported_parameters(fit, fit.law, answer.seen, prepared.laid_out)._asdict(),
         tests=(),
         criteria=information_criteria(float(residuals @ residuals), fit.count, fit.theta.size - len(fit.known)),
         yic=young_information_criterion(residuals, values, fit.theta[free], fit.law.covariance[np.ix_(free, free)]),

@@ -12,9 +12,10 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import CtidError
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
-from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Options
 from ctid_cli.estimators.loop_output_error import LoopOutputError
+from ctid_cli.estimators.measured_fit import MeasuredFit
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.criterion import criteria_of

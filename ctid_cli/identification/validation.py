@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.identification import Validation, laid_out_validation, validated
+from ctid_cli.estimators.measured_fit import MeasuredFit
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import Searched, criteria_of
 from ctid_cli.identification.initial_states import states_of

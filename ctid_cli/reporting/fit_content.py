@@ -12,9 +12,9 @@ import numpy as np
 from ctid_cli.canonical import plain
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
-from ctid_cli.estimators.delay_profile import MeasuredFit, MultiInputFit
 from ctid_cli.estimators.identification import Identification, Validation
 from ctid_cli.estimators.loop_output_error import LoopFit
+from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
 from ctid_cli.inference.derived import GAIN_UNIT, modes_of
 from ctid_cli.inference.intervals import BIASED, UncertainValue

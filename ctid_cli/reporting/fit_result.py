@@ -13,9 +13,10 @@ import numpy as np
 import pandas as pd
 
 from ctid_cli.errors import StorageError
-from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, MultiInputFit
+from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Identification, Options, models_of
 from ctid_cli.estimators.loop_output_error import LoopOutputError
+from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
 from ctid_cli.identification.sentences import spelled
 from ctid_cli.inference.fit import Status

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.estimators.additive_srivc import AdditiveFit
-from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.measured_fit import MeasuredFit
 from ctid_cli.estimators.useful_redundancy import RedundantFit
 from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.inference.criteria import fit_percent, r_squared
