@@ -41,7 +41,7 @@ from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.sensitivities import Structure, SumStructure
 from ctid_cli.inference.signal_features import outliers
 from ctid_cli.models.additive import AdditiveModel
-from ctid_cli.models.several_inputs import AnyModel, delays_of, fractions_of
+from ctid_cli.models.several_inputs import AnyModel, SystemModel, delays_of, fractions_of
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
@@ -217,7 +217,7 @@ class MeasuredRecords:
         assert isinstance(self.degrees, Degrees)
         degrees = replace(self.degrees, orders=(poles,), zeros=tuple(zeros))
         other.layout = replace(self.layout, degrees=degrees)
-        other.problem = self.problem._replace(**degrees.asked)
+        other.problem = self.problem._replace(**degrees.search_arguments)
         return other
 
     @property
@@ -275,8 +275,8 @@ class MeasuredRecords:
             data = tuple(_one_period(*pair) for pair in zip(self.data, periods, strict=True))
         else:
             periods, data = (0.0,) * len(self.data), tuple(self.data)
-        layout, asked = self.layout, dict(self.degrees.asked)
-        return Problem(data, asked.pop("zeros"), layout.initial_state, layout.trend, periods, **asked)
+        layout, arguments = self.layout, dict(self.degrees.search_arguments)
+        return Problem(data, arguments.pop("zeros"), layout.initial_state, layout.trend, periods, **arguments)
 
     def part(self) -> "MeasuredRecords | None":
         """Return the most active parts of long records, with separate initial states; None if they do not suffice."""
@@ -385,7 +385,7 @@ class MeasuredRecords:
         parts = sensitivities(self.problem, *self.parameters(found), found.delays)
         return [data.y_used - eps for data, (_, eps) in zip(self.problem.records, parts, strict=True)]
 
-    def squared_error_at(self, model: AnyModel | AdditiveModel, delay: float, k: int = 0) -> float:
+    def squared_error_at(self, model: SystemModel, delay: float, k: int = 0) -> float:
         """Return the least sum of squared output errors at a given delay of an input, in the basin of a model."""
         delays = delays_of(model)
         delays[k] = delay
@@ -395,7 +395,7 @@ class MeasuredRecords:
         poles = self.free_poles(model)
         return local_minimum(self.problem, poles, delays, bounds, known=self.known).squared_error
 
-    def errors_of(self, model: AnyModel | AdditiveModel) -> AppliedModel:
+    def errors_of(self, model: SystemModel) -> AppliedModel:
         """Return the errors of a given model on these records, each with its best initial state and offset."""
         free = [True] * len(delays_of(model))
         layout = replace(self.layout, degrees=self.degrees.with_orders(model, free))
@@ -411,7 +411,7 @@ class MeasuredRecords:
         slopes = tuple(psi for psi, _ in found)
         return AppliedModel(tuple(residuals), self.used(), *self.own(layout, theta), slopes)
 
-    def free_poles(self, model: AnyModel | AdditiveModel) -> ComplexArray:
+    def free_poles(self, model: SystemModel) -> ComplexArray:
         """Return the poles of a model without its integrators."""
         if isinstance(model, AdditiveModel):
             return poles_of_submodels(model)
@@ -425,7 +425,7 @@ class MeasuredRecords:
         """Mask of the known coefficients, including those that are zero due to integrators."""
         return self.degrees.given(self.known)
 
-    def layout_of(self, model: AnyModel | AdditiveModel) -> Layout:
+    def layout_of(self, model: SystemModel) -> Layout:
         """Return the layout of the parameters of a model that may have fewer poles."""
         return replace(self.layout, degrees=self.degrees.with_orders(model, self.degrees.delays))
 
@@ -439,10 +439,10 @@ class MeasuredRecords:
 def _bridged(record: Record) -> Record:
     """Return a record with outliers replaced by interpolation between their neighbours."""
     present = np.flatnonzero(record.valid)
-    wild = present[outliers(record.y[present])]
-    kept = np.setdiff1d(present, wild)
+    outlying = present[outliers(record.y[present])]
+    kept = np.setdiff1d(present, outlying)
     y = record.y.copy()
-    y[wild] = np.interp(record.t[wild], record.t[kept], record.y[kept])
+    y[outlying] = np.interp(record.t[outlying], record.t[kept], record.y[kept])
     return replace(record, y=y)
 
 
@@ -487,10 +487,10 @@ def refuse_collinear(record: Record) -> None:
         return
     _, values, right = np.linalg.svd(u / lengths, full_matrices=False)
     if values[-1] < COLLINEAR * values[0]:
-        alike = [name for name, weight in zip(record.held, right[-1], strict=True) if abs(weight) > INVOLVED]
+        collinear = [name for name, weight in zip(record.held, right[-1], strict=True) if abs(weight) > INVOLVED]
         raise DataError(
-            f"{named(record)}the inputs {' and '.join(alike)} are collinear: one is a linear function of the others, "
-            "and their responses cannot be told apart; drop one, or record them moving independently"
+            f"{named(record)}the inputs {' and '.join(collinear)} are collinear: one is a linear function of the "
+            "others, and their responses cannot be told apart; drop one, or record them moving independently"
         )
 
 

@@ -81,7 +81,7 @@ def automatic_start(record: Record, problem: AdditiveProblem) -> ModalStart:
         best = _best(problem, sets)
     if best is None:
         raise DataError(
-            f"{named(record)}no start was found: {data.count} samples show no modes of the structure asked for; give "
+            f"{named(record)}no start was found: {data.count} samples show no modes of this structure; give "
             "the start, or take a longer record or fewer poles"
         )
     text = f"{best.way}; numerators by least squares on the output error; the best of {len(sets)} sets of poles."

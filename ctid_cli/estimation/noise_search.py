@@ -42,8 +42,8 @@ def joint_optimum(
         return joint
     white, size = measured.whitened_by(joint.noise.noise), found.start[0].size
     # Structures with poles at infinity are not searched again.
-    alike = [start for start in starts if start[0].size == size]
-    starts = [joint.found.start, *alike]
+    same_order = [start for start in starts if start[0].size == size]
+    starts = [joint.found.start, *same_order]
     nested = nested and sum(e.size for e in measured.outputs) <= LONG
     other = white.best(starts, nested) if nested else white.local(*starts)
     if other.start[0].size != size:

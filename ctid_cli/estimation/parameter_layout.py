@@ -13,7 +13,7 @@ from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.inference.sensitivities import Structure, SumStructure
 from ctid_cli.models.additive import AdditiveModel, Term
-from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, fractions_of
+from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, SystemModel, fractions_of
 
 #: Names of the parameters of the powers of time that are added to the response.
 TREND_NAMES = ("offset", "drift", "drift2", "drift3")
@@ -61,7 +61,7 @@ class Degrees:
         return sum(self.orders)
 
     @property
-    def asked(self) -> dict[str, Any]:
+    def search_arguments(self) -> dict[str, Any]:
         """Corresponding arguments of the search problem."""
         if self.common:
             most = max(self.zeros)
@@ -159,7 +159,7 @@ class Degrees:
             places += [*range(a.start, a.stop), *range(own.start, own.stop)]
         return found, np.eye(self.poles + self.numerators)[places]
 
-    def with_orders(self, model: AnyModel | AdditiveModel, delays: Sequence[bool]) -> "Degrees":
+    def with_orders(self, model: SystemModel, delays: Sequence[bool]) -> "Degrees":
         """Return the degrees for the denominators of a model that may have fewer poles."""
         assert not isinstance(model, AdditiveModel)
         fractions = fractions_of(model)
@@ -180,7 +180,7 @@ class SumDegrees:
         return (self.structure.delay,)
 
     @property
-    def asked(self) -> dict[str, Any]:
+    def search_arguments(self) -> dict[str, Any]:
         """Corresponding arguments of the search problem."""
         return {"zeros": self.structure.zeros, "terms": self.structure.terms}
 
@@ -225,7 +225,7 @@ class SumDegrees:
         """Return the sum as one transfer function."""
         return found.model
 
-    def theta_of(self, model: AnyModel | AdditiveModel) -> Array:
+    def theta_of(self, model: SystemModel) -> Array:
         """Return the parameters of a model of these degrees."""
         assert isinstance(model, AdditiveModel)
         return self.structure.theta_of(model)
@@ -234,7 +234,7 @@ class SumDegrees:
         """Return B and the monic A of each fraction, and the derivatives of their coefficients by the parameters."""
         return self.structure.fractions_of(theta)
 
-    def with_orders(self, model: AnyModel | AdditiveModel, delays: Sequence[bool]) -> "SumDegrees":
+    def with_orders(self, model: SystemModel, delays: Sequence[bool]) -> "SumDegrees":
         """Return a copy with the flag of the delay replaced."""
         return SumDegrees(replace(self.structure, delay=delays[0]))
 
@@ -275,7 +275,7 @@ class Layout:
             names += [f"{TREND_NAMES[power]}{tail}" for power in self.trend]
         return tuple(names)
 
-    def theta(self, model: AnyModel | AdditiveModel) -> Array:
+    def theta(self, model: SystemModel) -> Array:
         """Return the parameters of a model of these degrees, and zeros for those of the experiments."""
         own = self.degrees.theta_of(model)  # type: ignore[arg-type]  # each has models of one kind
         return np.concatenate((own, np.zeros(self.experiments * self.own)))

@@ -126,7 +126,7 @@ class FrequencyDomainFit(MeasuredFit):
         measured = _laid_out(self, self.data)
         super().leave_out(lambda: samples_at(measured, self.model, self.theta, None)._asdict())
 
-    def answers(self, frequencies: Array) -> ComplexArray:
+    def responses_at(self, frequencies: Array) -> ComplexArray:
         """Return the response of the model in the form of the data: ``G(jw)``, or that of samples.
 
         Parameters

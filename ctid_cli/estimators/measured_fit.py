@@ -333,7 +333,7 @@ def fitted(
 
 def with_noise(
     measured: MeasuredRecords,
-    beside: MeasuredFit,
+    output_error: MeasuredFit,
     found: Optimum,
     noise_model: str,
     starts: Sequence[Begin],
@@ -342,8 +342,8 @@ def with_noise(
 ) -> MeasuredFit:
     """Return the maximum-likelihood fit of plant and noise, with an output-error fit for comparison."""
     joint = joint_optimum(measured, found, orders_of(noise_model), starts, nested=nested)
-    fit = fitted(measured, replace(joint.found, tried=found.tried, agree=found.agree), beside.profile, None)
-    law = beside.uncertainty("robust")
+    fit = fitted(measured, replace(joint.found, tried=found.tried, agree=found.agree), output_error.profile, None)
+    law = output_error.uncertainty("robust")
     robust = law.covariance
     with np.errstate(invalid="ignore"):
         errors = np.sqrt(np.diag(robust))
@@ -352,16 +352,16 @@ def with_noise(
         covariance=noise_covariance(joint.noise, fit.residuals, fit.used),
         deviance=joint.noise.deviance,
         chosen=noise_model == "auto",
-        output_error=beside.theta,
+        output_error=output_error.theta,
         output_error_errors=errors,
-        output_error_fit=beside.fit_percent,
+        output_error_fit=output_error.fit_percent,
     )
     fit = replace(fit, noise=estimate)
     efficient = fit.uncertainty("white").covariance
     shared = measured.layout_of(fit.model).degrees.size
     own = (np.arange(fit.theta.size) < shared) & (errors > 0) & (np.diag(efficient) > 0)
     pair = robust[np.ix_(own, own)], efficient[np.ix_(own, own)]
-    test = hausman((beside.theta - fit.theta)[own], *pair, law.degrees_of_freedom)
+    test = hausman((output_error.theta - fit.theta)[own], *pair, law.degrees_of_freedom)
     return replace(fit, noise=replace(estimate, test=test))
 
 

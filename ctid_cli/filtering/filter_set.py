@@ -144,27 +144,6 @@ def _check_beta(beta: float) -> None:
         )
 
 
-def sufficient_number_of_filters(beta: float, bandwidth: float, largest_error: float) -> int:
-    r"""Return a number of filters sufficient for the necessary condition (40); often far fewer satisfy it.
-
-    Equations (55)-(57): with i0 the first maximum of the longest period, by (36), that is not below the largest error,
-    ``nf >= (1/M + beta - 2)/(1/M - 1)``, ``M = (z - 4/(z pi^2))/(z + 2 - 4/((z + 2) pi^2))``, ``z = 4 i0 - 3``. This
-    uses the approximation (36). With the true extrema the number suffices for beta >= 1.7192; below, errors just beyond
-    the first maximum of the longest period are smaller than every positive minimum, and no number of filters suffices.
-    """
-    _check_beta(beta)
-    require_positive("bandwidth", bandwidth, "rad/s")
-    require_positive("largest_error", largest_error, "s")
-    # Maximum i lies at (z/4 - 1/(z pi^2)) periods, z = 4 i - 1; solving for z gives the two maxima around an error.
-    ratio = largest_error * bandwidth / (2 * math.pi * beta)
-    i0 = max(1, math.ceil((2 * (ratio + math.hypot(ratio, 1 / math.pi)) + 1) / 4))
-    if i0 == 1:
-        return 1
-    z = 4 * i0 - 3
-    inverse = (z + 2 - 4 / ((z + 2) * math.pi**2)) / (z - 4 / (z * math.pi**2))
-    return math.ceil((inverse + beta - 2) / (inverse - 1))
-
-
 @dataclass(frozen=True)
 class ServedInterval:
     """Interval of delay errors from which the same filters descend closer to zero, to the same minima."""

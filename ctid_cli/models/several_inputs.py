@@ -47,8 +47,10 @@ class MultiInputModel:
         return np.concatenate([part.poles for part in different])
 
 
-#: A model of records.
+#: Transfer functions of one input or of several.
 AnyModel = TransferFunction | MultiInputModel
+#: Any model of a system, a sum of submodels among them.
+SystemModel = AnyModel | AdditiveModel
 
 
 def fractions_of(model: AnyModel) -> tuple[TransferFunction, ...]:
@@ -57,13 +59,13 @@ def fractions_of(model: AnyModel) -> tuple[TransferFunction, ...]:
 
 
 def parts_of(
-    model: AnyModel | AdditiveModel, inputs: Iterable[str]
+    model: SystemModel, inputs: Iterable[str]
 ) -> Mapping[str, TransferFunction] | dict[str, TransferFunction | AdditiveModel]:
     """Return the model of each input by its name."""
     return model.parts if isinstance(model, MultiInputModel) else dict.fromkeys(inputs, model)
 
 
-def parameters_of(model: AnyModel | AdditiveModel) -> dict[str, float]:
+def parameters_of(model: SystemModel) -> dict[str, float]:
     """Return coefficients and delays by name."""
     if isinstance(model, MultiInputModel):
         return model.parameters
@@ -75,7 +77,7 @@ def is_delay(name: str) -> bool:
     return name == "delay" or name.endswith("_delay")
 
 
-def delays_of(model: AnyModel | AdditiveModel) -> list[float]:
+def delays_of(model: SystemModel) -> list[float]:
     """Return the delay of each input [s]."""
     if isinstance(model, AdditiveModel):
         return [model.delay]

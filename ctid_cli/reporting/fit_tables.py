@@ -50,7 +50,7 @@ def fit_tables(result: FitResult) -> dict[str, pd.DataFrame]:
 
 def line_frame(fit: FrequencyDomainFit, units: Units) -> pd.DataFrame:
     """Return values, model and residuals at each line of a frequency response."""
-    data, model = fit.data, fit.answers(fit.data.frequencies)
+    data, model = fit.data, fit.responses_at(fit.data.frequencies)
     columns = {f"frequency [rad/{units.time}]": data.frequencies}
     for name, values in (("", data.response), ("model_", model), ("residual_", data.response - model)):
         columns[units.label(f"{name}real", units.gain)] = values.real

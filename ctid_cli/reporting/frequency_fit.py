@@ -162,7 +162,7 @@ class FrequencyFitResult(FitResult):
 def frequency_fit_drawing(fit: FrequencyDomainFit, units: Units) -> Drawing:
     """Return a figure of gain and phase of values and model, and the residuals with the standard errors."""
     data, seen = fit.data, fit.data.frequencies > 0.0
-    w, values, model = data.frequencies[seen], data.response[seen], fit.answers(data.frequencies)[seen]
+    w, values, model = data.frequencies[seen], data.response[seen], fit.responses_at(data.frequencies)[seen]
     angle = np.unwrap(np.angle(model))
     near = angle + np.angle(values * np.exp(-1j * angle))
     panels = ((decibels(np.abs(values)), decibels(np.abs(model))), (np.rad2deg(near), np.rad2deg(angle)))

@@ -20,7 +20,7 @@ from ctid_cli.inference.intervals import normal_quantile
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import ContinuousController, ContinuousPid, Relay
 from ctid_cli.models.factoring import factored, factored_jacobian
-from ctid_cli.models.several_inputs import MultiInputModel, parts_of
+from ctid_cli.models.several_inputs import MultiInputModel, SystemModel, parts_of
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.excitation import Excitation
@@ -103,7 +103,7 @@ class DataSet:
     """A record with its true model and validation record, where known."""
 
     record: Record
-    true_model: TransferFunction | AdditiveModel | MultiInputModel | None = None
+    true_model: SystemModel | None = None
     validation: Record | None = None
     #: Function that returns the record of a fresh data set, if requested.
     fresh: Callable[[], Record] | None = None
@@ -150,7 +150,7 @@ class SimulatedSource:
     """Data sets from a simulated system."""
 
     #: Of several inputs the model with the excitation of each by its name.
-    system: TransferFunction | AdditiveModel | MultiInputModel | System
+    system: SystemModel | System
     excitation: Excitation | Mapping[str, Excitation] | None
     sampling: Sampling
     noise: Noise | None
@@ -213,9 +213,7 @@ class SimulatedSource:
             reference = applied["u"]
             held = HeldSignal(times, reference.at(times), reference.hold)
             return DataSet(self._record_in(self.loop, system, held, replicate), true_model=system)
-        true_model = (
-            self.system if isinstance(self.system, TransferFunction | AdditiveModel | MultiInputModel) else None
-        )
+        true_model = self.system if isinstance(self.system, SystemModel) else None
         with at("system"):
             if true_model is None:
                 output = samples_of(self.system, "simulate", applied["u"], times, size=times.size)
@@ -404,9 +402,7 @@ def _applied(generator: Any, times: Array, rng: np.random.Generator) -> HeldSign
     return found
 
 
-def _simulated(
-    model: TransferFunction | AdditiveModel | MultiInputModel, inputs: Mapping[str, HeldSignal], times: Array
-) -> Array:
+def _simulated(model: SystemModel, inputs: Mapping[str, HeldSignal], times: Array) -> Array:
     """Return the output of a model: the sum of its responses to all inputs."""
     from ctid_cli.filtering.simulate import simulate, simulate_additive
 

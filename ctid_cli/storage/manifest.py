@@ -21,9 +21,7 @@ from ctid_cli.storage import columns
 from ctid_cli.written_files import EXPERIMENT
 
 if TYPE_CHECKING:
-    from ctid_cli.models.additive import AdditiveModel
-    from ctid_cli.models.several_inputs import MultiInputModel
-    from ctid_cli.models.transfer_function import TransferFunction
+    from ctid_cli.models.several_inputs import SystemModel
 
 Manifest = dict[str, Any]
 #: Maximum number of estimates of one plan.
@@ -241,7 +239,7 @@ def swept_names(manifest: Manifest) -> list[str]:
     return list(dict.fromkeys(name for part in parts for name in part["swept"]))
 
 
-def true_system(cell: Mapping[str, Any]) -> TransferFunction | AdditiveModel | MultiInputModel | None:
+def true_system(cell: Mapping[str, Any]) -> SystemModel | None:
     """Return the system of a data cell; None for a custom system, a measured record or a signal."""
     from ctid_cli.models.additive import AdditiveModel, Submodel
     from ctid_cli.models.several_inputs import MultiInputModel

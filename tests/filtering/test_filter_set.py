@@ -12,7 +12,6 @@ from ctid_cli.filtering.filter_set import (
     convergence_region,
     extrema,
     ideal_cost,
-    sufficient_number_of_filters,
 )
 from ctid_cli.filtering.lowpass import Lowpass
 
@@ -135,27 +134,6 @@ def test_second_case(exact):
     assert [n for n in range(2, 16) if check_filters(FilterSet(26.85, n).cutoffs, 8.0, exact).passes] == [*range(7, 16)]
     (gap,) = check_filters(FilterSet(26.85, 9).cutoffs, 15.0, exact).gaps
     assert gap == pytest.approx((14.2961, 14.3331), abs=1e-4)
-
-
-def test_sufficient_numbers():
-    assert sufficient_number_of_filters(10, 26.85, 8) == 60
-    assert sufficient_number_of_filters(10, 26.85, 15) == 114
-    assert sufficient_number_of_filters(10, 2.02, 15) == 1
-    # the number changes exactly where the error passes a maximum (36) of the widest filter
-    for maximum in extrema(2.685, 9)[::2]:
-        below, above = (sufficient_number_of_filters(10, 26.85, maximum * factor) for factor in (1 - 1e-9, 1 + 1e-9))
-        assert below < above
-    with pytest.raises(ValueError, match="largest_error must be a positive number"):
-        sufficient_number_of_filters(10, 26.85, 0.0)
-    with pytest.raises(ValueError, match="beta"):
-        sufficient_number_of_filters(1.5, 26.85, 8.0)
-
-
-@given(beta=st.floats(1.7193, 10), ratio=st.floats(0.72, 8))
-def test_the_sufficient_number_suffices(beta, ratio):
-    largest = ratio * beta
-    n = sufficient_number_of_filters(beta, 2 * np.pi, largest)
-    assert check_filters(FilterSet(2 * np.pi, n, beta).cutoffs, largest).passes
 
 
 @given(

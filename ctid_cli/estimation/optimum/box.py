@@ -63,8 +63,8 @@ LIMITS = {
         1e-2,
         1.0,
         "with an estimated state slower poles fit noise as free responses, and the cost has no interior minimum; with "
-        "a known state such a pole is hardly told from an integrator, and still computed to the digits that a minimum "
-        "needs",
+        "a known state such a pole is hardly distinguishable from an integrator, and is still computed to the digits "
+        "that a minimum needs",
         "a pole is indistinguishable from an integrator over this record",
     ),
     "fastest": Limit(

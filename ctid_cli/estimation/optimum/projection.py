@@ -184,9 +184,9 @@ def weights_of(problem: Problem, speed: Array, damping: Array) -> Weights | None
         proper = block_diagonal(own)
         tables.append(np.vstack((proper, np.concatenate(directs))) if channel.direct >= 0 else proper)
     table = block_diagonal(tables)
-    asked = table[:, known]
-    lengths = np.linalg.norm(asked, axis=0)
-    whole, triangle = np.linalg.qr(asked / lengths, mode="complete")
+    constrained = table[:, known]
+    lengths = np.linalg.norm(constrained, axis=0)
+    whole, triangle = np.linalg.qr(constrained / lengths, mode="complete")
     count = lengths.size
     given = whole[:, :count] @ np.linalg.solve(triangle[:count].T, problem.numerator[known] / lengths)
     return Weights(whole[:, count:], given)

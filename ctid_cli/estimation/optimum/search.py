@@ -220,9 +220,9 @@ class Descent:
         scale = np.zeros(here.gradient.size)
         for taken in range(most_steps):
             here = self._faced(here)
-            there = next((other for other in known if _alike(here, other, self.box)), None)
-            if there is not None:
-                return there
+            reached = next((other for other in known if _close(here, other, self.box)), None)
+            if reached is not None:
+                return reached
             scale = np.maximum(scale, _lengths(here))
             ways = self._freedom(here, scale)
             scaled, slope = ways.reduced(here.gradient, here.curvature)
@@ -302,7 +302,7 @@ class Descent:
             ways = self._freedom(here, _lengths(here), kinked)
             free = ways.free
             if not ways.basis.shape[1]:
-                return self._judged(here, free, 0.0, None)
+                return self._classified(here, free, 0.0, None)
             fresh = second is None
             second = self.hessian(here) if second is None else second
             scaled, slope = ways.reduced(here.gradient, second)
@@ -311,7 +311,7 @@ class Descent:
             promise = np.inf if saddle else promise / max(here.squared_error, self.floor)
             modes = values, ways.whole(vectors)
             if promise <= AIM:
-                return self._judged(here, free, promise, modes)
+                return self._classified(here, free, promise, modes)
             step = ways.whole(_newton_step(values, vectors, slope))
             length = float(np.abs(step).max())
             # At a saddle the gradient does not determine the step length.
@@ -336,8 +336,8 @@ class Descent:
                     kinked, second = {**kinked, k: place}, None
                     continue
             if lower is None:
-                return self._judged(here, free, promise, modes)
-        return self._judged(here, free, promise, modes)
+                return self._classified(here, free, promise, modes)
+        return self._classified(here, free, promise, modes)
 
     def _lower_along(self, here: Local, step: Array, both: bool) -> tuple[Array, Point, Projected] | None:
         """Return the longest fraction of a step that reduces the squared error, with ``both`` in either direction."""
@@ -409,7 +409,7 @@ class Descent:
                 high, after = middle, between
         return min((here, before, after), key=lambda one: one.squared_error)
 
-    def _judged(self, here: Local, free: BoolArray, promise: float, modes: tuple[Array, Array] | None) -> Local:
+    def _classified(self, here: Local, free: BoolArray, promise: float, modes: tuple[Array, Array] | None) -> Local:
         held = ~free
         pinned, bound, at_bound = False, held.copy(), []
         for k, place in self.box.delay_places.items():
@@ -481,7 +481,7 @@ def _same(one: Point, other: Point) -> bool:
     )
 
 
-def _alike(here: Local, other: Local, box: Box) -> bool:
+def _close(here: Local, other: Local, box: Box) -> bool:
     """Return whether two points are close enough to converge to one minimum."""
     if here.squared_error >= (1 + CLOSE) * other.squared_error:
         return False

@@ -313,19 +313,8 @@ class StructureSearch:
         if added == 1 and box.slowest < slowest:
             # One frequency for all poles close to integrators.
             frequencies = np.append(frequencies, np.sqrt(box.slowest * slowest))
-        where, points = [], []
-        for w in frequencies.tolist():
-            for zeta in effort.dampings if added == 2 else (1.0,):
-                pole = w * complex(-zeta, np.sqrt(1 - zeta * zeta))
-                new = [pole, pole.conjugate()] if added == 2 else [complex(-w)]
-                where.append((np.log(w), np.log(zeta)))
-                points.append(point_of(np.concatenate((roots, new)), delay, box))
-        chosen: list[int] = []
-        for k in np.argsort(self.descent(zeros).squared_errors(points), kind="stable").tolist():
-            apart = all(np.abs(np.subtract(where[k], where[other])).max() > APART for other in chosen)
-            if apart and len(chosen) < most:
-                chosen.append(k)
-        return [points[k] for k in chosen]
+        dampings = effort.dampings if added == 2 else ()
+        return with_added_poles(self.descent(zeros), box, (roots, delay), frequencies.tolist(), dampings, most)
 
     def along_delay(self, zeros: int, points: list[Point]) -> list[Point]:
         """Return the points, and starts at the minima of the profile over each delay for the poles of the best point.
@@ -373,6 +362,33 @@ class StructureSearch:
 def _at(values: tuple[T, ...], k: int, value: T) -> tuple[T, ...]:
     """Return ``values`` with element ``k`` replaced."""
     return (*values[:k], value, *values[k + 1 :])
+
+
+def with_added_poles(
+    descent: Descent,
+    box: Box,
+    base: tuple[ComplexArray, float | Sequence[float]],
+    frequencies: Sequence[float],
+    dampings: Sequence[float],
+    most: int,
+) -> list[Point]:
+    """Return the best starts with a pole, or a pair of one of the dampings, added to given ones, by elimination only.
+
+    ``base``: poles, and delays. The added poles of the starts differ by at least ``APART``.
+    """
+    where, points, (roots, delays) = [], [], base
+    for w in frequencies:
+        for zeta in dampings or (1.0,):
+            pole = w * complex(-zeta, np.sqrt(1 - zeta * zeta))
+            new = [pole, pole.conjugate()] if dampings else [complex(-w)]
+            where.append((np.log(w), np.log(zeta)))
+            points.append(point_of(np.concatenate((roots, new)), delays, box))
+    chosen: list[int] = []
+    for k in np.argsort(descent.squared_errors(points), kind="stable").tolist():
+        apart = all(np.abs(np.subtract(where[k], where[other])).max() > APART for other in chosen)
+        if apart and len(chosen) < most:
+            chosen.append(k)
+    return [points[k] for k in chosen]
 
 
 def lowest_minima(values: Array, most: int) -> list[int]:

@@ -9,8 +9,8 @@ import numpy as np
 from ctid_cli.arrays import ComplexArray
 from ctid_cli.estimation.optimum.box import Box, Point, point_of
 from ctid_cli.estimation.optimum.projection import Problem
-from ctid_cli.estimation.optimum.search import Descent, Local
-from ctid_cli.estimation.optimum.starts import APART, StructureSearch
+from ctid_cli.estimation.optimum.search import Local
+from ctid_cli.estimation.optimum.starts import StructureSearch, with_added_poles
 from ctid_cli.models.additive import Term
 
 #: Number of frequencies of an added pole or pair, and dampings of a pair.
@@ -49,7 +49,7 @@ class SumGrowth:
 
     def _added(self, terms: tuple[Term, ...], known: Sequence[Local]) -> list[Local]:
         """Return the lowest minima of a sum, from those with fewer poles in the last term."""
-        problem = replace_terms(self.problem, terms)
+        problem = self.problem._replace(terms=terms)
         box = replace(self.box, parts=problem.parts)
         search = StructureSearch(problem, box)
         descent, order = search.descent(problem.zeros), sum(term.poles for term in terms)
@@ -59,9 +59,13 @@ class SumGrowth:
         delays = search.delays(FIRST_DELAYS) or [box.each_delay[0][0]]
         bases = bases or [(np.zeros(0, dtype=complex), delay) for delay in delays]
         starts: list[Point] = []
+        frequencies = np.geomspace(box.spread[0], min(box.fastest, box.imaginary), FREQUENCIES + 2)[1:-1].tolist()
         for roots, delay in bases:
-            added = order - roots.size
-            starts += _extended(descent, box, (roots, delay), added)
+            if added := order - roots.size:
+                dampings = DAMPINGS if added == 2 else ()
+                starts += with_added_poles(descent, box, (roots, delay), frequencies, dampings, PLACES)
+            else:
+                starts.append(point_of(roots, delay, box))
         if not known:
             starts = descent.sorted(starts)[: PLACES * KEPT]
         for start in starts:
@@ -70,30 +74,6 @@ class SumGrowth:
         found.sort(key=lambda local: local.squared_error)
         distinct = [one for k, one in enumerate(found) if one not in found[:k]]
         return distinct[:KEPT]
-
-
-def _extended(descent: Descent, box: Box, base: tuple[ComplexArray, float], added: int) -> list[Point]:
-    """Return the best poles, or pairs, added to the last submodel of a sum, by elimination only."""
-    roots, delay = base
-    if not added:
-        return [point_of(roots, delay, box)]
-    frequencies = np.geomspace(box.spread[0], min(box.fastest, box.imaginary), FREQUENCIES + 2)[1:-1].tolist()
-    new = [(w, zeta) for w in frequencies for zeta in (DAMPINGS if added == 2 else (1.0,))]
-    pairs = [w * complex(-zeta, np.sqrt(1.0 - zeta * zeta)) for w, zeta in new]
-    poles = [[pole, pole.conjugate()] if added == 2 else [complex(-abs(pole))] for pole in pairs]
-    points = [point_of(np.concatenate((roots, own)), delay, box) for own in poles]
-    chosen: list[int] = []
-    for k in np.argsort(descent.squared_errors(points), kind="stable").tolist():
-        if all(np.abs(np.log(new[k]) - np.log(new[other])).max() > APART for other in chosen):
-            chosen.append(k)
-        if len(chosen) == PLACES:
-            break
-    return [points[k] for k in chosen]
-
-
-def replace_terms(problem: Problem, terms: tuple[Term, ...]) -> Problem:
-    """Return the problem of the same records for another sum."""
-    return problem._replace(terms=terms)
 
 
 def _rearranged(point: Point, order: Sequence[Term], terms: Sequence[Term], box: Box) -> Point:
@@ -108,8 +88,8 @@ def in_order(point: Point, terms: Sequence[Term], box: Box) -> Point:
     """Return the sum with submodels of equal structure sorted by natural frequency."""
     groups = _groups(point.poles, [term.poles for term in terms])
     rising = sorted(range(len(groups)), key=lambda k: float(np.abs(groups[k]).min(initial=np.inf)))
-    alike = {term: iter([groups[k] for k in rising if terms[k] == term]) for term in terms}
-    return _joined([next(alike[term]) for term in terms], point, box)
+    of_term = {term: iter([groups[k] for k in rising if terms[k] == term]) for term in terms}
+    return _joined([next(of_term[term]) for term in terms], point, box)
 
 
 def _joined(groups: Sequence[ComplexArray], point: Point, box: Box) -> Point:

@@ -132,8 +132,8 @@ def rows_of(
     """
     each = each_delay(delays)
     if isinstance(data, FrequencyLines):
-        answers = forms[0].at_lines(data, each[0].place(data.interval), columns.second)
-        yield data.parts(np.column_stack((answers, data.response)))
+        model_response = forms[0].at_lines(data, each[0].place(data.interval), columns.second)
+        yield data.parts(np.column_stack((model_response, data.response)))
         return
     whitener = None if noise is None else Whitener(noise.noise, columns.size)
     second, done, inputs = columns.second, 0, data.inputs
