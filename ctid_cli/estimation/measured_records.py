@@ -27,105 +27,34 @@ from ctid_cli.estimation.optimum.best_model import (
     most_active_parts,
     poles_of_submodels,
 )
-from ctid_cli.estimation.optimum.box import ANYWHERE, Bounds, each_bounds, point_of
-from ctid_cli.estimation.optimum.chain import Chain, block_diagonal, numerators
+from ctid_cli.estimation.optimum.box import Bounds, each_bounds
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
-from ctid_cli.estimation.optimum.triangle import Columns, Delay, rows_of
+from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimation.parameter_layout import Degrees, Layout, SumDegrees
+from ctid_cli.estimation.record_preparation import (
+    above_level,
+    part_of_record,
+    period_of,
+    refuse_collinear,
+    within_one_period,
+    without_means,
+    without_outliers,
+)
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
 from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.sensitivities import Structure, SumStructure
-from ctid_cli.inference.signal_features import outliers
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.several_inputs import AnyModel, SystemModel, delays_of, fractions_of
-from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, Offset, OutputHold
 
 #: Number of random starts, plus the same number for each pole.
 RANDOM_STARTS = 2
-#: Inputs are collinear if a combination of them, each scaled to length one, is shorter than the first number; inputs
-#: with a larger share in it than the second are named.
-COLLINEAR, INVOLVED = 1e-6, 1e-3
-
-
-def sensitivities(problem: Problem, layout: Layout, theta: Array, delays: Sequence[float]) -> list[tuple[Array, Array]]:
-    """Return the derivatives of the output by the parameters, and the output error, at the used samples of each record.
-
-    Delays that are parameters equal those of theta. With integrators the last coefficients of a denominator are zero.
-    """
-    degrees = layout.degrees
-    fractions, chain_rule = degrees.fractions_of(theta)
-    total, count = chain_rule.shape
-    places = [degrees.delay(k) for k in range(len(delays))]
-    seconds = [given if place is None else theta[place] for given, place in zip(delays, places, strict=True)]
-    arrangement = problem.arranged(degrees.poles - sum(problem.each_integrators))
-    columns = Columns.of(arrangement, True, layout.initial_state, layout.trend)
-    # Required combinations of the columns of the rows (states, inputs and others): first the derivatives by the
-    # coefficients of all monic fractions.
-    monic = np.zeros((columns.size, total))
-    common, free = np.zeros((columns.size, layout.size + 1)), np.zeros((columns.size, total))
-    forms, to_powers, column = list[tuple[Chain, Array, Array]](), np.zeros((arrangement.order,) * 2), 0
-    for k, channel in enumerate(arrangement.channels):
-        rows, powers, outputs, direct, first = [], list[Array](), [], np.zeros(len(channel.terms)), 0
-        states, driven = monic[columns.z(k)], monic[columns.states(k)][channel.order :]
-        alone = free[columns.free_states(columns.free.index(k))] if k in columns.free else np.zeros_like(free)
-        for place, term in enumerate(channel.terms):
-            (b, a), fractions = fractions[0], fractions[1:]
-            order, m = a.size - 1, b.size - 1
-            own, at = slice(first, first + order), slice(column, column + order)
-            rows.append(_sections_of(a, term.integrators, problem))
-            # From the states to p^(n-1)/A ... 1/A. With n zeros B/A = b0 + B'/A, and p^n/A u = u - sum a_i p^(n-i)/A u.
-            powers.append(np.asarray(np.linalg.inv(numerators(*rows[-1])), dtype=float))
-            turned = powers[-1].T
-            driven[own, at] = -turned
-            alone[channel.order :][own, at] = -turned
-            states[own, at.stop : at.stop + m + 1] = np.column_stack((-turned @ a[1:], turned))[:, order - m :]
-            if m == order:
-                monic[columns.u(k), at.stop] = 1.0
-                direct[place], b = b[0], (b - b[0] * a)[1:]
-            outputs.append(np.concatenate((np.zeros(order - b.size), b)) @ powers[-1])
-            first, column = first + order, at.stop + m + 1
-        form, output = Chain.of(rows), np.concatenate(outputs)
-        forms.append((form, output, direct))
-        to_powers[channel.states, channel.states] = block_diagonal(powers)
-        if (delay := places[channel.input]) is not None:
-            common[columns.z(k), delay] = -(output @ form.dynamics)
-            common[columns.u(k), delay] = -(output @ form.gain)
-        common[columns.z(k), -1], common[columns.u(k), -1] = -output, -direct.sum()
-    common[:, :count] += (monic + free) @ chain_rule
-    common[columns.y, -1] = 1.0
-    result = []
-    for record, (data, period) in enumerate(zip(problem.records, problem.periods, strict=True)):
-        first = layout.first(record)
-        own_values = theta[first : first + layout.own]
-        n = arrangement.order
-        state = (own_values[:n] if layout.initial_state else np.zeros(n)) @ to_powers
-        each = zip(forms, arrangement.channels, strict=True)
-        driving = [form.driving(output, direct, state[one.states]) for (form, output, direct), one in each]
-        wanted = common.copy()
-        for number, k in enumerate(columns.free):
-            own = arrangement.channels[k].states
-            wanted[columns.free_z(number), first + own.start : first + own.stop] = to_powers[own, own].T
-        wanted[columns.powers, first + layout.own - len(layout.trend) : first + layout.own] = np.eye(len(layout.trend))
-        wanted[:, -1] -= wanted[:, first : first + layout.own] @ own_values
-        parts = rows_of(driving, columns, tuple(Delay(float(tau), -1) for tau in seconds), data, period)
-        found = np.vstack([part.T @ wanted for part in parts])
-        result.append((found[:, :-1], found[:, -1].copy()))
-    return result
-
-
-def _sections_of(denominator: Array, integrators: int, problem: Problem) -> tuple[Array, Array]:
-    """Return the sections of a denominator, whose last coefficients are zero with integrators."""
-    stable = np.roots(denominator[: denominator.size - integrators]).astype(complex)
-    point = point_of(stable, 0.0, ANYWHERE)
-    (sections,) = problem._replace(terms=(), integrators=integrators).rows(point.speed, point.damping)
-    return sections
 
 
 class Treatment(NamedTuple):
@@ -180,7 +109,7 @@ class MeasuredRecords:
         for record in records:
             self._check_input(record)
         removed = treatment.offset == "remove"
-        bridged = [_bridged(record) if treatment.bridge else record for record in records]
+        bridged = [without_outliers(record) if treatment.bridge else record for record in records]
         level = treatment.input_before
         centred = [without_means(record) if removed else above_level(record, level) for record in bridged]
         self.records = [one for one, _, _ in centred]
@@ -271,8 +200,8 @@ class MeasuredRecords:
     def problem(self) -> Problem:
         """Records and eliminated terms of the search."""
         if self.treatment.initial_state == "periodic":
-            periods = tuple(_period(record) for record in self.records)
-            data = tuple(_one_period(*pair) for pair in zip(self.data, periods, strict=True))
+            periods = tuple(period_of(record) for record in self.records)
+            data = tuple(within_one_period(*pair) for pair in zip(self.data, periods, strict=True))
         else:
             periods, data = (0.0,) * len(self.data), tuple(self.data)
         layout, arguments = self.layout, dict(self.degrees.search_arguments)
@@ -285,7 +214,7 @@ class MeasuredRecords:
         if parts is None or treatment.initial_state == "periodic":
             return None
         offset: Offset = "none" if treatment.offset == "remove" else treatment.offset
-        cut = [_cut(record, part) for record, part in zip(self.records, parts, strict=True)]
+        cut = [part_of_record(record, part) for record, part in zip(self.records, parts, strict=True)]
         with suppress(DataError):
             own = treatment._replace(initial_state="estimate", offset=offset, bridge=False, input_before=None)
             return MeasuredRecords(cut, self.degrees, own)
@@ -434,76 +363,3 @@ class MeasuredRecords:
         own = [layout.own_of(theta, k) for k in range(layout.experiments)]
         offsets = tuple(y0 + c for y0, (_, c) in zip(self.offsets, own, strict=True))
         return tuple(state for state, _ in own), offsets
-
-
-def _bridged(record: Record) -> Record:
-    """Return a record with outliers replaced by interpolation between their neighbours."""
-    present = np.flatnonzero(record.valid)
-    outlying = present[outliers(record.y[present])]
-    kept = np.setdiff1d(present, outlying)
-    y = record.y.copy()
-    y[outlying] = np.interp(record.t[outlying], record.t[kept], record.y[kept])
-    return replace(record, y=y)
-
-
-def _cut(record: Record, part: slice) -> Record:
-    """Return part of a record, with the input known at its samples."""
-    t = record.t[part]
-    inputs = {name: HeldSignal(t, signal.values[part], signal.hold) for name, signal in record.held.items()}
-    return Record(t, record.y[part], inputs, name=record.name)
-
-
-def above_level(record: Record, before: InputBefore) -> tuple[Record, list[float], float]:
-    """Return a record with inputs relative to their levels before it, these levels, and zero for its output."""
-    firsts = [float(signal.values[0]) for signal in record.held.values()]
-    levels = firsts if before == "first" else [float(before or 0.0)] * len(firsts)
-    return _lowered(record, levels), levels, 0.0
-
-
-def without_means(record: Record) -> tuple[Record, list[float], float]:
-    """Return a record without the mean of its output and the time averages of its inputs, and these levels."""
-    y0 = float(np.nanmean(record.y))
-    means = [float(np.mean(signal.at(record.t))) for signal in record.held.values()]
-    loop = record.loop and replace(record.loop, reference=record.loop.reference - record.loop.reference.mean())
-    return Record(record.t, record.y - y0, _lowered(record, means).inputs, name=record.name, loop=loop), means, y0
-
-
-def _lowered(record: Record, levels: Sequence[float]) -> Record:
-    """Return a record with levels subtracted from its inputs."""
-    if not any(levels):
-        return record
-    pairs = zip(record.held.items(), levels, strict=True)
-    return replace(
-        record, inputs={name: HeldSignal(one.t, one.values - level, one.hold) for (name, one), level in pairs}
-    )
-
-
-def refuse_collinear(record: Record) -> None:
-    """Refuse collinear inputs, whose responses cannot be distinguished."""
-    u = np.column_stack([signal.at(record.t) for signal in record.held.values()])
-    u = u - u.mean(axis=0)
-    lengths = np.linalg.norm(u, axis=0)
-    if not lengths.all():
-        return
-    _, values, right = np.linalg.svd(u / lengths, full_matrices=False)
-    if values[-1] < COLLINEAR * values[0]:
-        collinear = [name for name, weight in zip(record.held, right[-1], strict=True) if abs(weight) > INVOLVED]
-        raise DataError(
-            f"{named(record)}the inputs {' and '.join(collinear)} are collinear: one is a linear function of the "
-            "others, and their responses cannot be told apart; drop one, or record them moving independently"
-        )
-
-
-def _period(record: Record) -> float:
-    """Return the period of a periodic record: its duration plus one interval."""
-    return record.duration + (record.interval or float(np.median(np.diff(record.t))))
-
-
-def _one_period(data: FilterData, period: float) -> FilterData:
-    """Return the record with the breaks of its input within one period."""
-    data = data._replace(further=tuple(_one_period(one, period) for one in data.further))
-    within = data.tu < data.tu[0] + period * (1 - 1e-9)
-    if within.all():
-        return data
-    # Filters for regular clocks require one break per sample.
-    return data._replace(tu=data.tu[within].copy(), u=data.u[within].copy(), interval=0.0)

@@ -9,9 +9,10 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Bound, Estimator, Fixed, Start, checked_bounds, places_of
-from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, Treatment, sensitivities
+from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, Treatment
 from ctid_cli.estimation.optimum.best_model import Begin
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
+from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimation.parameter_bounds import BoundedSearch, Quantity, quantities_of
 from ctid_cli.estimation.parameter_layout import Degrees
 from ctid_cli.estimation.profile_search import Profile, search_delay

@@ -20,7 +20,8 @@ from ctid_cli.estimation.common import (
     quality,
 )
 from ctid_cli.estimation.loop_problem import LoopEstimate, LoopProblem
-from ctid_cli.estimation.measured_records import AppliedModel, without_means
+from ctid_cli.estimation.measured_records import AppliedModel
+from ctid_cli.estimation.record_preparation import without_means
 from ctid_cli.estimators.measured_fit import FittedSamples, MeasuredFit, Starts
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.filtering.filter_data import filter_data

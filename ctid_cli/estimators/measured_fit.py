@@ -11,10 +11,11 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimation.common import quality
-from ctid_cli.estimation.measured_records import MeasuredRecords, sensitivities
+from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.noise_search import joint_optimum
 from ctid_cli.estimation.optimum.best_model import Begin, Optimum
 from ctid_cli.estimation.optimum.box import Box
+from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimation.parameter_layout import Layout
 from ctid_cli.estimation.profile_search import Profile
 from ctid_cli.estimation.robust_fit import RobustFit

@@ -12,7 +12,8 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.additive_problem import Instruments, following
 from ctid_cli.estimation.common import Estimator, Fixed, Start, quality
-from ctid_cli.estimation.measured_records import AppliedModel, without_means
+from ctid_cli.estimation.measured_records import AppliedModel
+from ctid_cli.estimation.record_preparation import without_means
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
 from ctid_cli.estimators.measured_fit import FittedSamples, MeasuredFit
 from ctid_cli.filtering.filter_data import used_samples

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.measured_records import sensitivities
 from ctid_cli.estimation.optimum.projection import Problem
+from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimation.parameter_layout import Degrees, Layout
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.filtering.filter_data import filter_data

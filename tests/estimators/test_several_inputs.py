@@ -8,9 +8,9 @@ import pytest
 from ctid_cli import HeldSignal, Record, TransferFunction, identify, load_fit, save_fit, simulate
 from ctid_cli.errors import DataError, OptionError, UsageError
 from ctid_cli.estimation.common import Fixed
-from ctid_cli.estimation.measured_records import sensitivities
 from ctid_cli.estimation.optimum.box import box_of, point_of
 from ctid_cli.estimation.optimum.projection import project, slopes
+from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
 from ctid_cli.models.several_inputs import delays_of
 
