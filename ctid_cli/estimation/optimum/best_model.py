@@ -223,7 +223,8 @@ def _from_part(search: StructureSearch, pilot: StructureSearch, poles: int, fewe
 
 def best_of_orders(search: StructureSearch, poles: int, zeros: int) -> Optimum:
     """Return the least squared error of one structure of a common search, and of those in its closure."""
-    search.climb(poles, zeros, "fast")
+    # With more poles, one of many structures is not worth the search of all adjacent cells.
+    search.climb(poles, zeros, "always" if poles <= search.effort.along_delay else "fast")
     return _least(search, poles, zeros, True)
 
 

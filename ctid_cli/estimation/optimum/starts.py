@@ -54,7 +54,8 @@ class Effort(NamedTuple):
     #: every peak of the noise.
     alone: int
     denser: int
-    #: Greatest number of poles for which the whole range of the delay is searched.
+    #: Greatest number of poles for which the whole range of the delay, and all cells next to that of a minimum with
+    #: several inputs, are searched.
     along_delay: float
 
 
