@@ -190,7 +190,7 @@ class Structures:
         inputs = tuple(replace(own.get(name, InputModel(name)), zeros=m) for name, m in zip(names, zeros, strict=True))
         laid_out = self.measured.with_degrees(candidate.options.order, zeros)
         search = StructureSearch(laid_out.problem, self.search.box, effort=QUICK)
-        found = best_near(search, max(zeros), self._start(candidate.fit.model), "never")
+        found = best_near(search, max(zeros), self._start(candidate.fit.model))
         fit = fitted(laid_out, found, None, None)
         size = laid_out.layout.size - candidate.options.integrators
         return replace(candidate, options=replace(candidate.options, inputs=inputs), fit=fit, size=size)
@@ -260,8 +260,7 @@ class SmallModels:
         several: Several | None = None,
     ) -> None:
         self.records, self.span, self.delays, self.most, self.near = records, span, delays, most, near
-        # The same surplus zeros in all settings do not affect their comparison.
-        self.several = (several or Several())._replace(fewer_zeros=False)
+        self.several = several
         self._structures: dict[tuple[Setting, int], Structures] = {}
 
     def compared(self, settings: Sequence[Setting]) -> Ranking:

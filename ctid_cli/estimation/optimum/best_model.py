@@ -13,7 +13,7 @@ from ctid_cli.estimation.optimum.chain import all_numerators, numerators, polyno
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
 from ctid_cli.estimation.optimum.projection import Problem, Projected
 from ctid_cli.estimation.optimum.search import Ending, Local
-from ctid_cli.estimation.optimum.starts import SAME, Adjacent, StructureSearch, block_starts
+from ctid_cli.estimation.optimum.starts import SAME, StructureSearch, block_starts
 from ctid_cli.estimation.optimum.sum_starts import SumGrowth, in_order
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.sensitivities import SumStructure
@@ -223,8 +223,7 @@ def _from_part(search: StructureSearch, pilot: StructureSearch, poles: int, fewe
 
 def best_of_orders(search: StructureSearch, poles: int, zeros: int) -> Optimum:
     """Return the least squared error of one structure of a common search, and of those in its closure."""
-    # With more poles, one of many structures is not worth the search of all adjacent cells.
-    search.climb(poles, zeros, "always" if poles <= search.effort.along_delay else "fast")
+    search.climb(poles, zeros)
     return _least(search, poles, zeros, True)
 
 
@@ -271,10 +270,10 @@ def best_sum(
     return _least(search, order, zeros, False)
 
 
-def best_near(search: StructureSearch, zeros: int, start: Begin, adjacent: Adjacent = "fast") -> Optimum:
+def best_near(search: StructureSearch, zeros: int, start: Begin) -> Optimum:
     """Return the least squared error in the basin of given denominators, without integrators, and delays."""
     point = _point(start, search.box)
-    search.refine(point.poles.size, zeros, [point], adjacent)
+    search.refine(point.poles.size, zeros, [point])
     return _least(search, point.poles.size, zeros, False)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import product
-from typing import Literal, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -35,8 +35,6 @@ REFINED_TOGETHER = 6
 MOST_DELAYS = 100
 
 
-#: Search of the delay cells adjacent to that of a minimum: never, if a pole is fast, or with several inputs always.
-Adjacent = Literal["never", "fast", "always"]
 T = TypeVar("T")
 
 
@@ -54,8 +52,7 @@ class Effort(NamedTuple):
     #: every peak of the noise.
     alone: int
     denser: int
-    #: Greatest number of poles for which the whole range of the delay, and all cells next to that of a minimum with
-    #: several inputs, are searched.
+    #: Greatest number of poles for which the whole range of the delay is searched.
     along_delay: float
 
 
@@ -106,8 +103,8 @@ class StructureSearch:
         """Largest difference of the numerator degree and the number of searched poles."""
         return self.problem.integrators - int(self.box.delay_free)
 
-    def climb(self, poles: int, zeros: int, adjacent: Adjacent = "always") -> None:
-        """Search a structure and all nested ones, the smallest first; ``adjacent`` concerns the structure itself."""
+    def climb(self, poles: int, zeros: int) -> None:
+        """Search a structure and all nested ones, the smallest first."""
         for n in range(min(poles, int(not self.problem.integrators)), poles + 1):
             for m in range(min(zeros, n + self.most_zeros) + 1):
                 if (n, m) in self._minima:
@@ -117,7 +114,7 @@ class StructureSearch:
                 else:
                     # Random starts too, so that a larger structure starts from all minima of this one.
                     points = self.from_below(n, m) + self.random_points(n)
-                self.refine(n, m, points, adjacent if (n, m) == (poles, zeros) else "fast")
+                self.refine(n, m, points)
 
     def minima(self, poles: int, zeros: int) -> list[Local]:
         """Return the known minima of a structure, the lowest first."""
@@ -142,7 +139,7 @@ class StructureSearch:
             minima[0] = self.descent(zeros).settle(minima[0])
         return minima[0]
 
-    def refine(self, poles: int, zeros: int, points: Iterable[Point], adjacent: Adjacent = "always") -> None:
+    def refine(self, poles: int, zeros: int, points: Iterable[Point]) -> None:
         """Search from points, then in delay cells adjacent to that of the best minimum; keep the lowest minima."""
         descent, kept = self.descent(zeros), self._minima.setdefault((poles, zeros), [])
         ends = self._ends.setdefault((poles, zeros), [])
@@ -153,7 +150,7 @@ class StructureSearch:
             kept.append(local)
             if not queue:
                 lowest = min(kept, key=lambda local: local.squared_error)
-                queue = self._in_adjacent_cells(lowest.point, cells, adjacent)
+                queue = self._in_adjacent_cells(lowest.point, cells)
         kept.sort(key=lambda local: local.squared_error)
         distinct: list[Local] = []
         for local in kept:
@@ -178,16 +175,15 @@ class StructureSearch:
         delay = self.best(1, 0).seconds if poles > 1 else self.first_delays
         return self._extended(zeros, np.zeros(0, dtype=complex), delay, poles, self.effort.alone, self.effort.denser)
 
-    def _in_adjacent_cells(self, point: Point, cells: set[tuple[int, int]], adjacent: Adjacent) -> list[Point]:
+    def _in_adjacent_cells(self, point: Point, cells: set[tuple[int, int]]) -> list[Point]:
         """Return starts in the delay cells adjacent to that of a minimum, except ``cells`` already visited.
 
         With a fast pole the cost is smooth only within each cell, and a minimum in one does not determine the next.
         With several inputs this was observed with slow poles too.
         """
         width, points = self.box.cell, list[Point]()
-        slow = float(point.speed.max(initial=0.0)) * width < FAST
-        unneeded = adjacent == "never" or (slow and not (adjacent == "always" and self.box.several_delays))
-        if not width or not point.speed.size or unneeded:
+        slow = not self.box.several_delays and float(point.speed.max(initial=0.0)) * width < FAST
+        if not width or not point.speed.size or slow:
             return []
         for k in self.box.free_delays:
             (low, high), own = self.box.each_delay[k], point.delays[k].cell
