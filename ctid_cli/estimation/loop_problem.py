@@ -26,6 +26,7 @@ from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.loop_response import LoopResponse
 from ctid_cli.filtering.submodels import OPEN_LOOP, LoopData
 from ctid_cli.inference.fit import Status
+from ctid_cli.inference.loop_noise import SensitivityFunction
 from ctid_cli.models.additive import Term
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.record import Record
@@ -347,6 +348,13 @@ class LoopEstimate(NamedTuple):
     def radius(self) -> float:
         """Largest magnitude of the poles of the loop [-]."""
         return self.problem.response.radius(self.result.theta)
+
+    @property
+    def sensitivity(self) -> SensitivityFunction | None:
+        """Filter from the output noise to the output error; None in continuous time, or if samples are missing."""
+        poles, use = self.problem.response.open_and_closed_poles(self.result.theta), self.problem.data.use
+        complete = use[np.argmax(use) :].all()
+        return SensitivityFunction.of(*poles) if poles is not None and complete else None
 
     @property
     def status(self) -> Status:

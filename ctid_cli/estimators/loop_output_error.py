@@ -27,8 +27,9 @@ from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.loop import NO_DELAY
 from ctid_cli.filtering.loop_response import LoopResponse
 from ctid_cli.inference.fit import Status
+from ctid_cli.inference.loop_noise import SensitivityFunction
 from ctid_cli.inference.sensitivities import Structure
-from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.controller import ContinuousController, DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
@@ -56,9 +57,12 @@ class LoopFit(MeasuredFit):
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     loop_radius : float
         Largest magnitude of the poles of the loop with the controller over one sampling interval [-].
+    sensitivity : SensitivityFunction or None
+        Filter from the output noise to the output error; None with a controller in continuous time or missing samples.
     """
 
     loop_radius: float = float("nan")
+    sensitivity: SensitivityFunction | None = None
 
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
@@ -67,7 +71,15 @@ class LoopFit(MeasuredFit):
 
         ``auto`` is ``robust``, since the loop colours the noise. There are none if no minimum was reached.
         """
-        found = MeasuredFit.uncertainty(self, "robust" if kind == "auto" else kind, draws, progress)
+        found = estimate_uncertainty(
+            self.sensitivities,
+            self.residuals,
+            "robust" if kind == "auto" else kind,
+            draws,
+            tangent=self.tangent,
+            loop=self.sensitivity,
+            progress=progress,
+        )
         return found if self.status in DETERMINED else found.undefined
 
 
@@ -108,7 +120,8 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
     integrators : int, default 0
         Poles at the origin in addition to ``poles``, which may then be 0.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
-        Noise assumed for the standard errors; ``auto`` is ``robust``, since the loop colours the noise.
+        Noise assumed for the standard errors. ``auto`` is ``robust``, since the loop colours the noise: with a discrete
+        controller and no missing samples it is an autoregression filtered by the sensitivity function of the loop.
     bootstrap_draws : int, default 500
         Number of simulated noise sequences of a bootstrap [-].
 
@@ -231,6 +244,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
             starts=Starts(found.tried, found.agree),
             known=tuple(held),
             loop_radius=found.radius,
+            sensitivity=found.sensitivity,
             cost=np.nan,
             fit_percent=np.nan,
             r2=np.nan,

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.filtering.bank import chain_states
 from ctid_cli.filtering.filter_data import FilterData, split_delay
-from ctid_cli.filtering.loop import law_of, loop_pass, sampled_radius
+from ctid_cli.filtering.loop import law_of, loop_pass, sampled_poles, sampled_radius
 from ctid_cli.filtering.realisation import exponential_minus_identity, time_scale
 from ctid_cli.filtering.simulate import SampledModel
 from ctid_cli.models.controller import ContinuousController, DiscreteController
@@ -89,6 +89,15 @@ class LoopResponse:
             return sampled_radius(self._sampled(theta, None), self.controller)
         interval = self.data.interval or float(np.median(np.diff(self.data.t)))
         return float(np.exp(np.linalg.eigvals(self._whole(theta)[0]).real.max(initial=-np.inf) * interval))
+
+    def open_and_closed_poles(self, theta: Array) -> tuple[ComplexArray, ComplexArray] | None:
+        """Return the sampled poles of plant and discrete controller, and of their loop; None in continuous time."""
+        if not isinstance(self.controller, DiscreteController):
+            return None
+        plant = self._sampled(theta, None)
+        each = plant.state_space()[0], self.controller.state_space()[0]
+        separate = np.concatenate([np.linalg.eigvals(dynamics) for dynamics in each])
+        return separate.astype(complex), sampled_poles(plant, self.controller)
 
     # --- the plant ---------------------------------------------------------------------------------
 
