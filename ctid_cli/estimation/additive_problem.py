@@ -195,6 +195,14 @@ class AdditiveProblem:
         rows = self.filter.rows(theta)
         return None if rows is None else (rows[0], rows[2])
 
+    def least_errors(self, theta: Array) -> Array:
+        """Return the output errors of a model with its best free response."""
+        rows = self.rows(np.concatenate((theta, np.zeros(self.filter.free))))
+        if rows is None:
+            raise DataError("the response of the model is not finite on this record")
+        free = rows[0][:, self.size :]
+        return np.asarray(rows[1] - free @ np.linalg.lstsq(free, rows[1])[0])
+
     def consistency_margin(self, theta: Array) -> float:
         r"""Return the right side over the left side of the condition for consistency, which holds above 1.
 

@@ -19,8 +19,8 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.additive_problem import AdditiveProblem, estimate_submodels, following
 from ctid_cli.estimation.iteration import Iterated, Steps, inadmissible, iterate
-from ctid_cli.estimation.modal_start import automatic_start
 from ctid_cli.estimation.sampled_problem import reflect_unstable
+from ctid_cli.estimation.sum_start import automatic_start
 from ctid_cli.filtering.bank import Equations, standard_rows
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.loop_response import LoopResponse
@@ -223,7 +223,7 @@ class LoopProblem:
             loop = LoopData(following(response.data.u, self.data.u))
         problem = AdditiveProblem(self.data, (Term(response.poles, response.zeros, response.integrators),), delay, loop)
         with suppress(DataError):
-            model = automatic_start(record, problem).model
+            model = automatic_start(record, problem)
             found = unfactored(estimate_submodels(problem, model.theta, Steps(30, 1e-4, "relaxed")).model)
             b = np.concatenate((np.zeros(response.zeros + 1 - found.numerator.size), found.numerator))
             return np.concatenate((found.denominator[1 : response.poles + 1], b, [delay]))
