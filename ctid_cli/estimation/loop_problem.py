@@ -17,7 +17,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.additive_problem import AdditiveProblem, estimate_submodels, following
+from ctid_cli.estimation.additive_problem import AdditiveProblem, estimate_submodels, predicted_from
 from ctid_cli.estimation.iteration import Iterated, Steps, inadmissible, iterate
 from ctid_cli.estimation.sampled_problem import reflect_unstable
 from ctid_cli.estimation.sum_start import automatic_start
@@ -220,7 +220,7 @@ class LoopProblem:
         """
         response, loop = self.response, OPEN_LOOP
         if self.data.interval and not response.continuous:
-            loop = LoopData(following(response.data.u, self.data.u))
+            loop = LoopData(predicted_from(response.data.u, self.data.u))
         problem = AdditiveProblem(self.data, (Term(response.poles, response.zeros, response.integrators),), delay, loop)
         with suppress(DataError):
             model = automatic_start(record, problem)
@@ -242,13 +242,13 @@ class LoopProblem:
             else np.column_stack((rows[:, n] - u[:, ::-1] @ E[1:], u[:, ::-1]))
         )
         regressors = np.column_stack((by_a, by_b, np.ones((self.samples, int(self.offset)))))
-        seen = instruments.T @ regressors
-        if not np.isfinite(seen).all():
+        projected = instruments.T @ regressors
+        if not np.isfinite(projected).all():
             return None
-        lengths = np.linalg.norm(seen, axis=0)
+        lengths = np.linalg.norm(projected, axis=0)
         if not lengths.all():
             return None
-        found = np.linalg.lstsq(seen / lengths, instruments.T @ highest)[0] / lengths
+        found = np.linalg.lstsq(projected / lengths, instruments.T @ highest)[0] / lengths
         theta = np.append(found[: self.size - 1], delay)
         return theta if np.isfinite(theta).all() else None
 

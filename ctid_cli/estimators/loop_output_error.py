@@ -203,10 +203,10 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         data = filter_data(record)
         driven = filter_data(self._acting(record))
         kind = ContinuousController if loop.continuous else DiscreteController
-        law = kind(loop.controller.numerator, loop.controller.denominator)
+        controller = kind(loop.controller.numerator, loop.controller.denominator)
         at_controller, free = loop.enters == "controller", self.initial_state == "estimate"
         structure = self.poles, self.zeros, self.integrators
-        response = LoopResponse(driven, law, at_controller, *structure)
+        response = LoopResponse(driven, controller, at_controller, *structure)
         check_record(record, driven, self.poles + self.zeros + 2)
         problem = LoopProblem(data, response, self.offset == "estimate", free, self.delay_bounds)
         return LaidOutLoop(record, problem, u0[0], y0)
@@ -251,7 +251,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
             condition_number=np.nan,
             count=problem.samples,
         )
-        samples, tangent = self._judged(fit, problem)
+        samples, tangent = self._signals(fit, problem)
         psi, eps, y = samples.sensitivities[0] @ tangent, samples.residuals[0], problem.data.y_used
         moments = Equations(psi.T @ psi, psi.T @ eps, psi.T @ psi, float(eps @ eps), 0.0)
         fitness = quality(moments, float(np.sum((y - y.mean()) ** 2)), y.size)
@@ -270,7 +270,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         b = np.concatenate((np.zeros(self.zeros + 1 - b.size), b))
         return np.concatenate((fit.model.denominator[1 : self.poles + 1], b, [fit.model.delay]))
 
-    def _judged(self, fit: MeasuredFit, problem: LoopProblem) -> tuple[FittedSamples, Array]:
+    def _signals(self, fit: MeasuredFit, problem: LoopProblem) -> tuple[FittedSamples, Array]:
         """Return the signals of a fit at each used sample, and the free directions of its parameters."""
         theta = self._theta(fit)
         if self.searched and problem.cell is None:
@@ -301,7 +301,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
 
     def _samples(self, fit: MeasuredFit, laid_out: Any) -> FittedSamples:
         """Return the signals of a fit at each used sample, from its parameters."""
-        return self._judged(fit, laid_out.problem)[0]
+        return self._signals(fit, laid_out.problem)[0]
 
     def _applied(self, fit: MeasuredFit, laid_out: Any) -> AppliedModel:
         """Return the model in the loop of another record, with the best state and offset for it."""
@@ -309,6 +309,6 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         own = self._own(problem, self._theta(fit))
         states = own.size - int(problem.offset)
         moved = replace(fit, theta=np.concatenate((fit.theta[: fit.theta.size - own.size], own)))
-        samples = self._judged(moved, problem)[0]
+        samples = self._signals(moved, problem)[0]
         offset = float(own[-1]) if problem.offset else laid_out.offset
         return AppliedModel(samples.residuals, samples.used, (own[:states],), (offset,), samples.sensitivities)

@@ -144,12 +144,12 @@ def simulate_continuous_loop(
     t, from_reference = reference.t, controller.numerator if enters == "controller" else controller.denominator
     driven = ((reference, from_reference), (HeldSignal(t, -noise), controller.numerator))
 
-    def seen_at(side: Array) -> Array:
+    def response_with(side: Array) -> Array:
         parts = [simulate(TransferFunction(np.polymul(side, over), closed), signal, t) for signal, over in driven]
         return np.asarray(np.sum(parts, axis=0))
 
     with np.errstate(over="ignore", invalid="ignore"):
-        u, x = seen_at(plant.denominator), seen_at(plant.numerator)
+        u, x = response_with(plant.denominator), response_with(plant.numerator)
     if not (np.isfinite(u).all() and np.isfinite(x).all()):
         raise DataError("the signals of the closed loop are not finite; check reference, noise and stability")
     return LoopSignals(u, x)

@@ -77,11 +77,11 @@ class LoopResponse:
 
     def free(self, theta: Array, cell: int | None = None) -> Array:
         """Return the free responses to each entry of the initial state, shape (N, f)."""
-        still = replace(self, data=self.data._replace(u=np.zeros_like(self.data.u)))
+        unforced = replace(self, data=self.data._replace(u=np.zeros_like(self.data.u)))
         size = self.poles + self.integrators + self.controller.denominator.size - 1
         if not self.continuous:
             size += self._sampled(theta, cell).shift
-        return np.column_stack([still.rows(theta, 0, cell, unit).output for unit in np.eye(size)])
+        return np.column_stack([unforced.rows(theta, 0, cell, unit).output for unit in np.eye(size)])
 
     def radius(self, theta: Array) -> float:
         """Return the largest magnitude of the poles of the loop over one sampling interval; it is stable below 1."""
@@ -171,8 +171,8 @@ class LoopResponse:
         dynamics[:n, :n] += w0 * F
         dynamics[n:, n:] += A
         direct = d * closing * share
-        seen = (1.0 if self.at_controller else 0.0) - direct
-        return dynamics, np.concatenate((w0 * g * closing * share, B[:, 0] * seen)), y, direct
+        from_reference = (1.0 if self.at_controller else 0.0) - direct
+        return dynamics, np.concatenate((w0 * g * closing * share, B[:, 0] * from_reference)), y, direct
 
     def _continuous(self, theta: Array, count: int, state: Array | None) -> LoopRows:
         from scipy.linalg import schur  # slow to import
