@@ -153,9 +153,9 @@ class LoopProblem:
             left += linear[:, : state.size] @ state
         return Columns(rows.slopes[use], linear, left)
 
-    def rows(self, theta: Array) -> tuple[Array, Array] | None:
+    def rows(self, theta: Array, count: int | None = None) -> tuple[Array, Array] | None:
         """Return sensitivities and output error at the used samples with least-squares state and offset."""
-        columns = self.columns(theta)
+        columns = self.columns(theta, count)
         if columns is None:
             return None
         Q, _ = columns.basis
@@ -177,13 +177,9 @@ class LoopProblem:
 
     def squared_error(self, theta: Array) -> float:
         """Return the least squared error over state and offset; infinite if the response is not finite."""
-        columns = self.columns(theta, 0) if np.isfinite(theta).all() else None
-        if columns is None:
-            return np.inf
-        Q, _ = columns.basis
         with np.errstate(all="ignore"):
-            left = columns.left - Q @ (Q.T @ columns.left)
-            return float(np.nan_to_num(left @ left, nan=np.inf))
+            found = self.rows(theta, 0) if np.isfinite(theta).all() else None
+            return np.inf if found is None else float(np.nan_to_num(found[1] @ found[1], nan=np.inf))
 
     # --- starts --------------------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ from ctid_cli.estimation.common import (
     checked_bounds,
     quality,
 )
-from ctid_cli.estimation.loop_problem import LoopEstimate, LoopProblem
+from ctid_cli.estimation.loop_problem import Columns, LoopEstimate, LoopProblem
 from ctid_cli.estimation.measured_records import AppliedModel, without_means
 from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit, Starts
 from ctid_cli.filtering.bank import Equations
@@ -223,7 +223,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
     def _described(self, laid_out: LaidOutLoop, found: LoopEstimate) -> LoopFit:
         """Return the fit without its covariance."""
         problem, theta = found.problem, found.result.theta
-        own = self._own(problem, theta)
+        own = self._columns(problem, theta, 0).own
         names = Structure(self.order, self.zeros, self.searched).names
         states = own.size - int(problem.offset)
         names += tuple(f"x{k}" for k in range(1, states + 1)) + ("offset",) * problem.offset
@@ -257,12 +257,12 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         fitness = quality(moments, float(np.sum((y - y.mean()) ** 2)), y.size)
         return replace(fit, **samples._asdict(), tangent=tangent, **fitness)
 
-    def _own(self, problem: LoopProblem, theta: Array) -> Array:
-        """Return the least-squares state and offset for given parameters."""
-        columns = problem.columns(theta, 0)
+    def _columns(self, problem: LoopProblem, theta: Array, count: int | None = None) -> Columns:
+        """Return the signals of given parameters."""
+        columns = problem.columns(theta, count)
         if columns is None:
             raise DataError("the loop of this model with the controller has no finite output on this record")
-        return columns.own
+        return columns
 
     def _theta(self, fit: MeasuredFit) -> Array:
         """Return the parameters of the problem."""
@@ -275,9 +275,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         theta = self._theta(fit)
         if self.searched and problem.cell is None:
             problem = replace(problem, cell=problem.cell_of(theta[-1]))
-        columns = problem.columns(theta)
-        if columns is None:
-            raise DataError("the loop of this model with the controller has no finite output on this record")
+        columns = self._columns(problem, theta)
         own, size = fit.theta[fit.theta.size - columns.linear.shape[1] :], fit.theta.size
         first, last = self.poles, size - own.size
         psi = np.zeros((problem.samples, size))
@@ -306,7 +304,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
     def _applied(self, fit: MeasuredFit, laid_out: Any) -> AppliedModel:
         """Return the model in the loop of another record, with the best state and offset for it."""
         problem = laid_out.problem
-        own = self._own(problem, self._theta(fit))
+        own = self._columns(problem, self._theta(fit), 0).own
         states = own.size - int(problem.offset)
         moved = replace(fit, theta=np.concatenate((fit.theta[: fit.theta.size - own.size], own)))
         samples = self._signals(moved, problem)[0]
