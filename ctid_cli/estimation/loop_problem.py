@@ -347,10 +347,10 @@ class LoopEstimate(NamedTuple):
 
     @property
     def sensitivity(self) -> SensitivityFunction | None:
-        """Filter from the output noise to the output error; None in continuous time, or if samples are missing."""
+        """Filter from the output noise to the output error; None in continuous time, with gaps, or if unstable."""
         poles, use = self.problem.response.open_and_closed_poles(self.result.theta), self.problem.data.use
-        complete = use[np.argmax(use) :].all()
-        return SensitivityFunction.of(*poles) if poles is not None and complete else None
+        without_gaps = bool(use[np.argmax(use) :].all())
+        return SensitivityFunction.of(*poles) if poles and without_gaps and self.radius < 1.0 else None
 
     @property
     def status(self) -> Status:
