@@ -225,9 +225,8 @@ def campaign(given):
         print(k, f"{taken:.2f}", *errors[-1], file=sys.stderr, flush=True)
     print(" ".join(f"{name}={value}" for name, value in vars(given).items()))
     print_errors(names, errors, hits)
-    print(
-        f"{len(errors) - len(hits)} without intervals, ends {dict(ends)}, noise {dict(orders.most_common(4))}, {spent / given.records:.2f} CPU s a record"
-    )
+    ending = f"{len(errors) - len(hits)} without intervals, ends {dict(ends)}, noise {dict(orders.most_common(4))}"
+    print(f"{ending}, {spent / given.records:.2f} CPU s a record")
 
 
 if __name__ == "__main__":
