@@ -59,27 +59,27 @@ def main():
     parser.add_argument("--orders", choices=("true", "auto"), default="true")
     parser.add_argument("--held", type=int, default=5, help="samples of a step of the input")
     parser.add_argument("--seed", type=int, default=1)
-    asked = parser.parse_args()
-    pair = NOISES[asked.noise]
-    given = "auto" if asked.orders == "auto" else f"arma:{len(pair[1]) - 1},{len(pair[0]) - 1}"
+    options = parser.parse_args()
+    pair = NOISES[options.noise]
+    given = "auto" if options.orders == "auto" else f"arma:{len(pair[1]) - 1},{len(pair[0]) - 1}"
     estimator = Rivc(2, 0, DELAYS, noise_model=given, covariance="white")
-    errors, beside, covered, rejected, orders, seconds = [], [], [], 0, Counter(), 0.0
-    for replicate in range(asked.records):
-        record, bound = simulated(pair, asked.samples, asked.held, asked.snr_db, asked.seed, replicate)
+    errors, of_output_error, covered, rejected, orders, seconds = [], [], [], 0, Counter(), 0.0
+    for replicate in range(options.records):
+        record, bound = simulated(pair, options.samples, options.held, options.snr_db, options.seed, replicate)
         spent, fit = cpu(estimator.fit, record)
         seconds += spent
         errors.append((fit.theta - TRUE) / bound)
-        beside.append((fit.noise.output_error - TRUE) / bound)
+        of_output_error.append((fit.noise.output_error - TRUE) / bound)
         covered.append(np.abs(fit.theta - TRUE) <= fit.law.quantiles() * np.sqrt(np.diag(fit.covariance)))
         rejected += fit.noise.differs
         orders[fit.noise.orders] += 1
         print(replicate, f"{spent:.2f}", *errors[-1], file=sys.stderr, flush=True)
-    print(" ".join(f"{name}={value}" for name, value in vars(asked).items()))
-    squares = {"rmse": errors, "output error": beside}
+    print(" ".join(f"{name}={value}" for name, value in vars(options).items()))
+    squares = {"rmse": errors, "output error": of_output_error}
     more = {title: np.sqrt(np.mean(np.square(own), axis=0)) for title, own in squares.items()}
     print_errors(fit.parameter_names, errors, covered, **more)
-    print(f"hausman {100 * rejected / asked.records:.1f} %, orders {dict(orders.most_common(5))}")
-    print(f"{seconds / asked.records:.2f} s of a processor each")
+    print(f"hausman {100 * rejected / options.records:.1f} %, orders {dict(orders.most_common(5))}")
+    print(f"{seconds / options.records:.2f} s of a processor each")
 
 
 if __name__ == "__main__":

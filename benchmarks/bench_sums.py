@@ -51,13 +51,13 @@ def main():
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--estimate", action="store_true")
     parser.add_argument("--chosen", action="store_true")
-    asked = parser.parse_args()
-    own = {"initial_state": "estimate", "offset": "estimate"} if asked.estimate else {}
+    options = parser.parse_args()
+    own = {"initial_state": "estimate", "offset": "estimate"} if options.estimate else {}
     estimator = AdditiveOutputError(MODES, DELAYS, covariance="white", **own)
     errors, covered, numbers, statuses, seconds = [], [], Counter(), Counter(), 0.0
-    for replicate in range(asked.records):
-        record, bound = simulated(asked.samples, asked.snr_db, asked.seed, replicate)
-        if asked.chosen:
+    for replicate in range(options.records):
+        record, bound = simulated(options.samples, options.snr_db, options.seed, replicate)
+        if options.chosen:
             spent, choice = cpu(choose, record, Given(modes=(1, 4), delay_bounds=DELAYS))
             numbers[len(choice.options.terms)] += 1
         else:
@@ -69,13 +69,13 @@ def main():
             statuses[fit.status.name] += 1
         seconds += spent
         print(replicate, f"{spent:.2f}", *errors[-1:], file=sys.stderr, flush=True)
-    print(" ".join(f"{name}={value}" for name, value in vars(asked).items()))
-    if asked.chosen:
+    print(" ".join(f"{name}={value}" for name, value in vars(options).items()))
+    if options.chosen:
         print(f"numbers of modes {dict(sorted(numbers.items()))}")
     else:
         print_errors((*PLANT.names, "delay"), errors, covered)
         print(f"ends {dict(statuses.most_common())}")
-    print(f"{seconds / asked.records:.2f} s of a processor each")
+    print(f"{seconds / options.records:.2f} s of a processor each")
 
 
 if __name__ == "__main__":

@@ -61,13 +61,13 @@ def loop_data(record: Record, instruments: Instruments) -> LoopData:
         wanted = "an input that is held from sample to sample of a regular clock"
         raise DataError(f"{named(record)}instruments in a loop need {wanted}")
     if by_reference:
-        return LoopData(following(record.loop.reference, record.input.values))
+        return LoopData(predicted_from(record.loop.reference, record.input.values))
     assert record.loop.controller is not None
     controller = DiscreteController(record.loop.controller.numerator, record.loop.controller.denominator)
     return LoopData(plain_array(record.loop.reference), controller, record.loop.enters == "controller")
 
 
-def following(reference: Array, u: Array) -> Array:
+def predicted_from(reference: Array, u: Array) -> Array:
     """Return the best prediction of an input from the reference by a finite impulse response, from rest."""
     from scipy.linalg import solve_toeplitz  # slow to import
 
@@ -195,6 +195,14 @@ class AdditiveProblem:
         rows = self.filter.rows(theta)
         return None if rows is None else (rows[0], rows[2])
 
+    def least_errors(self, theta: Array) -> Array:
+        """Return the output errors of a model with its best free response."""
+        rows = self.rows(np.concatenate((theta, np.zeros(self.filter.free))))
+        if rows is None:
+            raise DataError("the response of the model is not finite on this record")
+        free = rows[0][:, self.size :]
+        return np.asarray(rows[1] - free @ np.linalg.lstsq(free, rows[1])[0])
+
     def consistency_margin(self, theta: Array) -> float:
         r"""Return the right side over the left side of the condition for consistency, which holds above 1.
 
@@ -208,12 +216,12 @@ class AdditiveProblem:
         if source is None or self.initial_state != "rest":
             return math.nan
         whole = self.data._replace(u=plain_array(source), use=np.ones_like(self.data.use))
-        still = replace(self, data=whole, loop=OPEN_LOOP)
-        rows = still.filter.rows(theta)
+        noise_free = replace(self, data=whole, loop=OPEN_LOOP)
+        rows = noise_free.filter.rows(theta)
         if rows is None:
             return math.nan
         # Noise-free regressors: from samples of the output of the model.
-        rows = replace(still, data=whole._replace(y=plain_array(rows[3]), use=self.data.use)).filter.rows(theta)
+        rows = replace(noise_free, data=whole._replace(y=plain_array(rows[3]), use=self.data.use)).filter.rows(theta)
         if rows is None:
             return math.nan
         psi, phi = (part / np.linalg.norm(rows[0], axis=0) for part in rows[:2])

@@ -17,15 +17,16 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.additive_problem import AdditiveProblem, estimate_submodels, following
+from ctid_cli.estimation.additive_problem import AdditiveProblem, estimate_submodels, predicted_from
 from ctid_cli.estimation.iteration import Iterated, Steps, inadmissible, iterate
-from ctid_cli.estimation.modal_start import automatic_start
 from ctid_cli.estimation.sampled_problem import reflect_unstable
+from ctid_cli.estimation.sum_start import automatic_start
 from ctid_cli.filtering.bank import Equations, standard_rows
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.loop_response import LoopResponse
 from ctid_cli.filtering.submodels import OPEN_LOOP, LoopData
 from ctid_cli.inference.fit import Status
+from ctid_cli.inference.loop_noise import SensitivityFunction
 from ctid_cli.models.additive import Term
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.record import Record
@@ -152,9 +153,9 @@ class LoopProblem:
             left += linear[:, : state.size] @ state
         return Columns(rows.slopes[use], linear, left)
 
-    def rows(self, theta: Array) -> tuple[Array, Array] | None:
+    def rows(self, theta: Array, count: int | None = None) -> tuple[Array, Array] | None:
         """Return sensitivities and output error at the used samples with least-squares state and offset."""
-        columns = self.columns(theta)
+        columns = self.columns(theta, count)
         if columns is None:
             return None
         Q, _ = columns.basis
@@ -176,13 +177,9 @@ class LoopProblem:
 
     def squared_error(self, theta: Array) -> float:
         """Return the least squared error over state and offset; infinite if the response is not finite."""
-        columns = self.columns(theta, 0) if np.isfinite(theta).all() else None
-        if columns is None:
-            return np.inf
-        Q, _ = columns.basis
         with np.errstate(all="ignore"):
-            left = columns.left - Q @ (Q.T @ columns.left)
-            return float(np.nan_to_num(left @ left, nan=np.inf))
+            found = self.rows(theta, 0) if np.isfinite(theta).all() else None
+            return np.inf if found is None else float(np.nan_to_num(found[1] @ found[1], nan=np.inf))
 
     # --- starts --------------------------------------------------------------------------------------
 
@@ -219,10 +216,10 @@ class LoopProblem:
         """
         response, loop = self.response, OPEN_LOOP
         if self.data.interval and not response.continuous:
-            loop = LoopData(following(response.data.u, self.data.u))
+            loop = LoopData(predicted_from(response.data.u, self.data.u))
         problem = AdditiveProblem(self.data, (Term(response.poles, response.zeros, response.integrators),), delay, loop)
         with suppress(DataError):
-            model = automatic_start(record, problem).model
+            model = automatic_start(record, problem)
             found = unfactored(estimate_submodels(problem, model.theta, Steps(30, 1e-4, "relaxed")).model)
             b = np.concatenate((np.zeros(response.zeros + 1 - found.numerator.size), found.numerator))
             return np.concatenate((found.denominator[1 : response.poles + 1], b, [delay]))
@@ -241,13 +238,13 @@ class LoopProblem:
             else np.column_stack((rows[:, n] - u[:, ::-1] @ E[1:], u[:, ::-1]))
         )
         regressors = np.column_stack((by_a, by_b, np.ones((self.samples, int(self.offset)))))
-        seen = instruments.T @ regressors
-        if not np.isfinite(seen).all():
+        projected = instruments.T @ regressors
+        if not np.isfinite(projected).all():
             return None
-        lengths = np.linalg.norm(seen, axis=0)
+        lengths = np.linalg.norm(projected, axis=0)
         if not lengths.all():
             return None
-        found = np.linalg.lstsq(seen / lengths, instruments.T @ highest)[0] / lengths
+        found = np.linalg.lstsq(projected / lengths, instruments.T @ highest)[0] / lengths
         theta = np.append(found[: self.size - 1], delay)
         return theta if np.isfinite(theta).all() else None
 
@@ -347,6 +344,13 @@ class LoopEstimate(NamedTuple):
     def radius(self) -> float:
         """Largest magnitude of the poles of the loop [-]."""
         return self.problem.response.radius(self.result.theta)
+
+    @property
+    def sensitivity(self) -> SensitivityFunction | None:
+        """Filter from the output noise to the output error; None in continuous time, with gaps, or if unstable."""
+        poles, use = self.problem.response.open_and_closed_poles(self.result.theta), self.problem.data.use
+        without_gaps = bool(use[np.argmax(use) :].all())
+        return SensitivityFunction.of(*poles) if poles and without_gaps and self.radius < 1.0 else None
 
     @property
     def status(self) -> Status:

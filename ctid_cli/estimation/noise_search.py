@@ -77,8 +77,8 @@ def _settled(measured: MeasuredRecords, joint: JointOptimum) -> JointOptimum:
     (found, noise), steps = joint, [steps_of(use) for use in measured.used()]
     for _ in range(MOST_ROUNDS if sum(noise.orders) else 0):
         found = measured.whitened_by(noise.noise).local(found.start)
-        following = fit_arma(_errors(measured, found), steps, noise.orders, noise)
-        settled, noise = noise.deviance - following.deviance < SETTLED, following
+        updated = fit_arma(_errors(measured, found), steps, noise.orders, noise)
+        settled, noise = noise.deviance - updated.deviance < SETTLED, updated
         if settled:
             break
     return JointOptimum(found, noise)

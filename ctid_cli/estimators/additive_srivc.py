@@ -22,7 +22,7 @@ from ctid_cli.estimation.additive_problem import (
 )
 from ctid_cli.estimation.common import Estimator, Fixed, Start, StartFrom, check_record, places_of
 from ctid_cli.estimation.iteration import StepRule, Steps
-from ctid_cli.estimation.modal_start import ModalStart, automatic_start
+from ctid_cli.estimation.sum_start import automatic_start
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.submodels import InitialState
 from ctid_cli.inference.derived import derived_parameters
@@ -36,6 +36,8 @@ from ctid_cli.signals.treatment import OutputHold
 
 #: Largest number of orders of the submodels that are tried to match known parameters.
 MOST_ORDERS = 5040
+#: Origin of an automatic start.
+FOUND = "Submodels were found one after the other, by output errors, or by innovations if those are coloured."
 TINY = float(np.finfo(float).tiny)
 
 
@@ -233,19 +235,20 @@ class Submodels:
     problem: AdditiveProblem
 
     @cached_property
-    def start(self) -> ModalStart:
+    def start(self) -> AdditiveModel:
         """Automatic start, computed once from the record."""
         return automatic_start(self.record, self.problem)
 
-    def started(self, given: Start | None) -> ModalStart:
-        """Return the given or the automatic start.
+    def started(self, given: Start | None) -> tuple[AdditiveModel, str]:
+        """Return the given or the automatic start, and its origin as a sentence.
 
         Its submodels are sorted by natural frequency, so that rounding does not depend on their order, unless
         parameters are fixed by name.
         """
-        found = self.start if given is None or given.model is None else ModalStart(given.model, "The start was given.")
-        check_submodels(found.model, self.problem.terms)
-        return found if self.problem.fixed else found._replace(model=found.model.sorted())
+        chosen = None if given is None else given.model
+        model, origin = (self.start, FOUND) if chosen is None else (chosen, "The start was given.")
+        check_submodels(model, self.problem.terms)
+        return model if self.problem.fixed else model.sorted(), origin
 
 
 def check_terms(terms: tuple[Term, ...]) -> None:

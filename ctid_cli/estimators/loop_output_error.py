@@ -19,7 +19,7 @@ from ctid_cli.estimation.common import (
     checked_bounds,
     quality,
 )
-from ctid_cli.estimation.loop_problem import LoopEstimate, LoopProblem
+from ctid_cli.estimation.loop_problem import Columns, LoopEstimate, LoopProblem
 from ctid_cli.estimation.measured_records import AppliedModel
 from ctid_cli.estimation.record_preparation import without_means
 from ctid_cli.estimators.measured_fit import FittedSamples, MeasuredFit, Starts
@@ -28,8 +28,9 @@ from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.loop import NO_DELAY
 from ctid_cli.filtering.loop_response import LoopResponse
 from ctid_cli.inference.fit import Status
+from ctid_cli.inference.loop_noise import SensitivityFunction
 from ctid_cli.inference.sensitivities import Structure
-from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.controller import ContinuousController, DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
@@ -57,9 +58,12 @@ class LoopFit(MeasuredFit):
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     loop_radius : float
         Largest magnitude of the poles of the loop with the controller over one sampling interval [-].
+    sensitivity : SensitivityFunction or None
+        Filter from the output noise to the output error; None with a controller in continuous time or missing samples.
     """
 
     loop_radius: float = float("nan")
+    sensitivity: SensitivityFunction | None = None
 
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
@@ -68,7 +72,15 @@ class LoopFit(MeasuredFit):
 
         ``auto`` is ``robust``, since the loop colours the noise. There are none if no minimum was reached.
         """
-        found = MeasuredFit.uncertainty(self, "robust" if kind == "auto" else kind, draws, progress)
+        found = estimate_uncertainty(
+            self.sensitivities,
+            self.residuals,
+            "robust" if kind == "auto" else kind,
+            draws,
+            tangent=self.tangent,
+            loop=self.sensitivity,
+            progress=progress,
+        )
         return found if self.status in DETERMINED else found.undefined
 
 
@@ -109,7 +121,8 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
     integrators : int, default 0
         Poles at the origin in addition to ``poles``, which may then be 0.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
-        Noise assumed for the standard errors; ``auto`` is ``robust``, since the loop colours the noise.
+        Noise assumed for the standard errors. ``auto`` is ``robust``, since the loop colours the noise: with a discrete
+        controller and no missing samples it is an autoregression filtered by the sensitivity function of the loop.
     bootstrap_draws : int, default 500
         Number of simulated noise sequences of a bootstrap [-].
 
@@ -191,10 +204,10 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         data = filter_data(record)
         driven = filter_data(self._acting(record))
         kind = ContinuousController if loop.continuous else DiscreteController
-        law = kind(loop.controller.numerator, loop.controller.denominator)
+        controller = kind(loop.controller.numerator, loop.controller.denominator)
         at_controller, free = loop.enters == "controller", self.initial_state == "estimate"
         structure = self.poles, self.zeros, self.integrators
-        response = LoopResponse(driven, law, at_controller, *structure)
+        response = LoopResponse(driven, controller, at_controller, *structure)
         check_record(record, driven, self.poles + self.zeros + 2)
         problem = LoopProblem(data, response, self.offset == "estimate", free, self.delay_bounds)
         return LaidOutLoop(record, problem, u0[0], y0)
@@ -211,7 +224,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
     def _described(self, laid_out: LaidOutLoop, found: LoopEstimate) -> LoopFit:
         """Return the fit without its covariance."""
         problem, theta = found.problem, found.result.theta
-        own = self._own(problem, theta)
+        own = self._columns(problem, theta, 0).own
         names = Structure(self.order, self.zeros, self.searched).names
         states = own.size - int(problem.offset)
         names += tuple(f"x{k}" for k in range(1, states + 1)) + ("offset",) * problem.offset
@@ -232,24 +245,25 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
             starts=Starts(found.tried, found.agree),
             known=tuple(held),
             loop_radius=found.radius,
+            sensitivity=found.sensitivity,
             cost=np.nan,
             fit_percent=np.nan,
             r2=np.nan,
             condition_number=np.nan,
             count=problem.samples,
         )
-        samples, tangent = self._judged(fit, problem)
+        samples, tangent = self._signals(fit, problem)
         psi, eps, y = samples.sensitivities[0] @ tangent, samples.residuals[0], problem.data.y_used
         moments = Equations(psi.T @ psi, psi.T @ eps, psi.T @ psi, float(eps @ eps), 0.0)
         fitness = quality(moments, float(np.sum((y - y.mean()) ** 2)), y.size)
         return replace(fit, **samples._asdict(), tangent=tangent, **fitness)
 
-    def _own(self, problem: LoopProblem, theta: Array) -> Array:
-        """Return the least-squares state and offset for given parameters."""
-        columns = problem.columns(theta, 0)
+    def _columns(self, problem: LoopProblem, theta: Array, count: int | None = None) -> Columns:
+        """Return the signals of given parameters."""
+        columns = problem.columns(theta, count)
         if columns is None:
             raise DataError("the loop of this model with the controller has no finite output on this record")
-        return columns.own
+        return columns
 
     def _theta(self, fit: MeasuredFit) -> Array:
         """Return the parameters of the problem."""
@@ -257,14 +271,12 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         b = np.concatenate((np.zeros(self.zeros + 1 - b.size), b))
         return np.concatenate((fit.model.denominator[1 : self.poles + 1], b, [fit.model.delay]))
 
-    def _judged(self, fit: MeasuredFit, problem: LoopProblem) -> tuple[FittedSamples, Array]:
+    def _signals(self, fit: MeasuredFit, problem: LoopProblem) -> tuple[FittedSamples, Array]:
         """Return the signals of a fit at each used sample, and the free directions of its parameters."""
         theta = self._theta(fit)
         if self.searched and problem.cell is None:
             problem = replace(problem, cell=problem.cell_of(theta[-1]))
-        columns = problem.columns(theta)
-        if columns is None:
-            raise DataError("the loop of this model with the controller has no finite output on this record")
+        columns = self._columns(problem, theta)
         own, size = fit.theta[fit.theta.size - columns.linear.shape[1] :], fit.theta.size
         first, last = self.poles, size - own.size
         psi = np.zeros((problem.samples, size))
@@ -288,14 +300,14 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
 
     def _samples(self, fit: MeasuredFit, laid_out: Any) -> FittedSamples:
         """Return the signals of a fit at each used sample, from its parameters."""
-        return self._judged(fit, laid_out.problem)[0]
+        return self._signals(fit, laid_out.problem)[0]
 
     def _applied(self, fit: MeasuredFit, laid_out: Any) -> AppliedModel:
         """Return the model in the loop of another record, with the best state and offset for it."""
         problem = laid_out.problem
-        own = self._own(problem, self._theta(fit))
+        own = self._columns(problem, self._theta(fit), 0).own
         states = own.size - int(problem.offset)
         moved = replace(fit, theta=np.concatenate((fit.theta[: fit.theta.size - own.size], own)))
-        samples = self._judged(moved, problem)[0]
+        samples = self._signals(moved, problem)[0]
         offset = float(own[-1]) if problem.offset else laid_out.offset
         return AppliedModel(samples.residuals, samples.used, (own[:states],), (offset,), samples.sensitivities)

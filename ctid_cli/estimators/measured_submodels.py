@@ -10,7 +10,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.additive_problem import Instruments, following
+from ctid_cli.estimation.additive_problem import Instruments, predicted_from
 from ctid_cli.estimation.common import Estimator, Fixed, Start, quality
 from ctid_cli.estimation.measured_records import AppliedModel
 from ctid_cli.estimation.record_preparation import without_means
@@ -309,7 +309,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
 def without_feedback(record: Record) -> Record:
     """Return an open-loop record with the part of the input that is predicted from the reference of the loop."""
     assert record.loop is not None
-    u = record.input.mean + following(record.loop.reference, record.input.values)
+    u = record.input.mean + predicted_from(record.loop.reference, record.input.values)
     return Record(record.t, record.y, HeldSignal(record.t, u, record.input.hold), name=record.name)
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering import kernels
 from ctid_cli.filtering.filter_data import plain_array
@@ -144,12 +144,12 @@ def simulate_continuous_loop(
     t, from_reference = reference.t, controller.numerator if enters == "controller" else controller.denominator
     driven = ((reference, from_reference), (HeldSignal(t, -noise), controller.numerator))
 
-    def seen_at(side: Array) -> Array:
+    def response_with(side: Array) -> Array:
         parts = [simulate(TransferFunction(np.polymul(side, over), closed), signal, t) for signal, over in driven]
         return np.asarray(np.sum(parts, axis=0))
 
     with np.errstate(over="ignore", invalid="ignore"):
-        u, x = seen_at(plant.denominator), seen_at(plant.numerator)
+        u, x = response_with(plant.denominator), response_with(plant.numerator)
     if not (np.isfinite(u).all() and np.isfinite(x).all()):
         raise DataError("the signals of the closed loop are not finite; check reference, noise and stability")
     return LoopSignals(u, x)
@@ -204,6 +204,11 @@ def loop_radius(model: AdditiveModel | TransferFunction, controller: Controller,
 
 def sampled_radius(sampled: SampledModel, discrete: DiscreteController) -> float:
     """Return the largest magnitude of the poles of the loop of a sampled model."""
+    return float(np.abs(sampled_poles(sampled, discrete)).max(initial=0.0))
+
+
+def sampled_poles(sampled: SampledModel, discrete: DiscreteController) -> ComplexArray:
+    """Return the poles of the loop of a sampled model."""
     _require_sampled_solution(sampled, discrete)
     A, B, C, D = sampled.state_space()
     Ac, Bc, Cc, Dc = discrete.state_space()
@@ -214,7 +219,7 @@ def sampled_radius(sampled: SampledModel, discrete: DiscreteController) -> float
     dynamics = np.vstack((B @ u, -Bc @ x))
     dynamics[:n, :n] += A
     dynamics[n:, n:] += Ac
-    return float(np.abs(np.linalg.eigvals(dynamics)).max(initial=0.0))
+    return np.asarray(np.linalg.eigvals(dynamics), dtype=complex)
 
 
 def _realised(controller: Controller) -> DiscreteController:

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.filtering.bank import chain_states
 from ctid_cli.filtering.filter_data import FilterData, split_delay
-from ctid_cli.filtering.loop import law_of, loop_pass, sampled_radius
+from ctid_cli.filtering.loop import law_of, loop_pass, sampled_poles, sampled_radius
 from ctid_cli.filtering.realisation import exponential_minus_identity, time_scale
 from ctid_cli.filtering.simulate import SampledModel
 from ctid_cli.models.controller import ContinuousController, DiscreteController
@@ -77,11 +77,11 @@ class LoopResponse:
 
     def free(self, theta: Array, cell: int | None = None) -> Array:
         """Return the free responses to each entry of the initial state, shape (N, f)."""
-        still = replace(self, data=self.data._replace(u=np.zeros_like(self.data.u)))
+        unforced = replace(self, data=self.data._replace(u=np.zeros_like(self.data.u)))
         size = self.poles + self.integrators + self.controller.denominator.size - 1
         if not self.continuous:
             size += self._sampled(theta, cell).shift
-        return np.column_stack([still.rows(theta, 0, cell, unit).output for unit in np.eye(size)])
+        return np.column_stack([unforced.rows(theta, 0, cell, unit).output for unit in np.eye(size)])
 
     def radius(self, theta: Array) -> float:
         """Return the largest magnitude of the poles of the loop over one sampling interval; it is stable below 1."""
@@ -89,6 +89,15 @@ class LoopResponse:
             return sampled_radius(self._sampled(theta, None), self.controller)
         interval = self.data.interval or float(np.median(np.diff(self.data.t)))
         return float(np.exp(np.linalg.eigvals(self._whole(theta)[0]).real.max(initial=-np.inf) * interval))
+
+    def open_and_closed_poles(self, theta: Array) -> tuple[ComplexArray, ComplexArray] | None:
+        """Return the sampled poles of plant and discrete controller, and of their loop; None in continuous time."""
+        if not isinstance(self.controller, DiscreteController):
+            return None
+        plant = self._sampled(theta, None)
+        each = plant.state_space()[0], self.controller.state_space()[0]
+        separate = np.concatenate([np.linalg.eigvals(dynamics) for dynamics in each])
+        return separate.astype(complex), sampled_poles(plant, self.controller)
 
     # --- the plant ---------------------------------------------------------------------------------
 
@@ -162,8 +171,8 @@ class LoopResponse:
         dynamics[:n, :n] += w0 * F
         dynamics[n:, n:] += A
         direct = d * closing * share
-        seen = (1.0 if self.at_controller else 0.0) - direct
-        return dynamics, np.concatenate((w0 * g * closing * share, B[:, 0] * seen)), y, direct
+        from_reference = (1.0 if self.at_controller else 0.0) - direct
+        return dynamics, np.concatenate((w0 * g * closing * share, B[:, 0] * from_reference)), y, direct
 
     def _continuous(self, theta: Array, count: int, state: Array | None) -> LoopRows:
         from scipy.linalg import schur  # slow to import

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.inference.loop_noise import SensitivityFunction
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model, fit_residual_noise
 from ctid_cli.text import listed
 
@@ -52,7 +53,9 @@ def condition_number(hessian: Array) -> float:
     return float(values[-1] / values[0]) if values[0] > 0 else float("inf")
 
 
-def robust_covariance(psi: Sequence[Array], residuals: Sequence[Array]) -> tuple[Array, NoiseModel]:
+def robust_covariance(
+    psi: Sequence[Array], residuals: Sequence[Array], loop: SensitivityFunction | None = None
+) -> tuple[Array, NoiseModel]:
     r"""Return the covariance ``M^-1 Sigma M^-1`` of an unweighted output-error estimate, and the coloured noise.
 
     With noise v independent of the input (open loop) and ``M = sum psi psi'``,
@@ -68,7 +71,9 @@ def robust_covariance(psi: Sequence[Array], residuals: Sequence[Array]) -> tuple
     third-order systems, noise of up to 50 samples' time constant: .89 to 1.04 of the true deviation. Where intervals of
     .02 and .2 s come in bursts of 100 samples it is .69 to 1.15.
 
-    With feedback from the output to the input the noise is not independent of psi, and the formula is not valid.
+    With feedback from the output to the input the noise is not independent of psi, and the formula is not valid. It is
+    valid for the output error of a simulated loop, whose input is the reference. With its sensitivity function S, that
+    error is S v, the autoregression is that of v, and ``sum psi S v = sum (S' psi) v``.
     """
     size, count = psi[0].shape[1], sum(block.size for block in residuals)
     found = unit_inverse(sum((block.T @ block for block in psi), np.zeros((size, size)))) if count > size else None
@@ -76,7 +81,11 @@ def robust_covariance(psi: Sequence[Array], residuals: Sequence[Array]) -> tuple
         return np.full((size, size), np.nan), fit_noise_model(residuals, max_order=0)
     inverse, scale = found
     scaled = [block * scale for block in psi]
-    noise = fit_residual_noise(scaled, residuals)
+    if loop is None:
+        noise = fit_residual_noise(scaled, residuals)
+    else:
+        noise = fit_residual_noise([loop.removed(block) for block in scaled], [loop.removed(e) for e in residuals])
+        scaled = [loop.transposed(block) for block in scaled]
     sigma = sum((noise.covariance_of(block) for block in scaled), np.zeros((size, size)))
     return sandwich(inverse, scale, sigma), noise
 

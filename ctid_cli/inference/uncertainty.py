@@ -11,6 +11,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.inference.covariance import robust_covariance, white_noise_covariance
 from ctid_cli.inference.innovations import SampledNoise
 from ctid_cli.inference.intervals import student_quantile
+from ctid_cli.inference.loop_noise import SensitivityFunction
 from ctid_cli.inference.noise_model import NoiseModel
 from ctid_cli.inference.residual_tests import all_white
 from ctid_cli.inference.sensitivities import Parametric
@@ -42,10 +43,18 @@ class BootstrapT:
         return float(np.quantile(ratios, level))
 
 
-def bootstrap_t(psi: Sequence[Array], noise: NoiseModel, draws: int, *, progress: Progress | None = None) -> BootstrapT:
+def bootstrap_t(
+    psi: Sequence[Array],
+    noise: NoiseModel,
+    draws: int,
+    *,
+    loop: SensitivityFunction | None = None,
+    progress: Progress | None = None,
+) -> BootstrapT:
     """Draw noise, and estimate from each draw the parameters, to first order, and their covariance.
 
-    To first order ``theta + M^-1 sum psi v`` is the estimate and ``v - psi M^-1 sum psi v`` are the residuals.
+    To first order ``theta + M^-1 sum psi v`` is the estimate and ``v - psi M^-1 sum psi v`` are the residuals, with v
+    filtered by the sensitivity function of a loop.
     """
     source = ArmaNoise((1.0,), tuple(noise.coefficients.tolist()), innovation_variance=noise.innovation_variance)
     rng = np.random.default_rng(SEED)
@@ -55,9 +64,10 @@ def bootstrap_t(psi: Sequence[Array], noise: NoiseModel, draws: int, *, progress
     errors, covariances = np.empty((draws, size)), np.empty((draws, size, size))
     for k in range(draws):
         drawn = [source.generate(np.empty(len(block)), rng) for block in psi]
+        drawn = drawn if loop is None else [loop.filtered(v) for v in drawn]
         errors[k] = solve @ np.concatenate(drawn)
         left = [v - block @ errors[k] for v, block in zip(drawn, psi, strict=True)]
-        covariances[k] = robust_covariance(psi, left)[0]
+        covariances[k] = robust_covariance(psi, left, loop)[0]
         if progress is not None:
             progress(k + 1, draws)
     return BootstrapT(errors, covariances)
@@ -158,11 +168,13 @@ def estimate_uncertainty(
     draws: int = DRAWS,
     *,
     tangent: Array | None = None,
+    loop: SensitivityFunction | None = None,
     progress: Progress | None = None,
 ) -> Uncertainty:
     """Return the uncertainty of an output-error estimate from sensitivities and residuals of each experiment.
 
-    With a tangent, shape (p, f), the parameters were free along its columns only, for example at a bound.
+    With a tangent, shape (p, f), the parameters were free along its columns only, for example at a bound. The output
+    error of a simulated loop is noise filtered by its sensitivity function.
     """
     basis = np.eye(psi[0].shape[1]) if tangent is None else tangent
     free = psi if tangent is None else [block @ tangent for block in psi]
@@ -173,10 +185,10 @@ def estimate_uncertainty(
         found = white_noise_covariance(hessian, sum(float(e @ e) for e in residuals), count)
         kind = "white"
     else:
-        found, noise = robust_covariance(free, residuals)
+        found, noise = robust_covariance(free, residuals, loop)
         effective = noise.effective_count(count)
         if kind == "bootstrap" and np.isfinite(found).all():
-            bootstrap = bootstrap_t(free, noise, draws, progress=progress)
+            bootstrap = bootstrap_t(free, noise, draws, loop=loop, progress=progress)
         kind = "robust" if bootstrap is None else "bootstrap"
     return Uncertainty(kind, basis, found, effective, bootstrap)
 

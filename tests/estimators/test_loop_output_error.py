@@ -135,6 +135,18 @@ def test_unstable_plant_with_its_delay(delay, bounds):
         assert name not in fit.parameters or abs(fit.parameters[name] - value) < 3.5 * fit.standard_errors[name]
 
 
+def test_output_error_is_noise_filtered_by_the_sensitivity_function():
+    plant = TransferFunction(STABLE.numerator, STABLE.denominator, 0.13)
+    one = record(plant, PI, noise=0.2, count=600)
+    fit = LoopOutputError(2, 0, (0.0, 0.4)).fit(one)
+    v = np.random.default_rng(2).standard_normal(600)
+    np.testing.assert_allclose(
+        fit.sensitivity.filtered(v), simulate_loop(fit.model, PI, 0 * v, v, 0.05).x + v, atol=1e-9
+    )
+    gap = replace(one, y=np.where(np.arange(600) == 300, np.nan, one.y))
+    assert LoopOutputError(2, 0, (0.0, 0.4)).fit(gap).sensitivity is None
+
+
 def test_integrator_offset_and_state_that_is_not_rest():
     whole = record(TransferFunction([2.0], [1.0, 1.0, 0.0]), DiscreteController([0.6], [1.0]), count=2500)
     late = slice(300, None)

@@ -14,6 +14,7 @@ from ctid_cli.inference.covariance import (
     robust_covariance,
     white_noise_covariance,
 )
+from ctid_cli.inference.loop_noise import SensitivityFunction
 from ctid_cli.inference.noise_model import fit_residual_noise
 from tests.inference.autoregression import autocovariance
 
@@ -85,6 +86,19 @@ def test_is_the_double_sum_over_all_pairs_of_samples():
     R = toeplitz(autocovariance(fit_residual_noise([psi], [v]), 200))
     M = np.linalg.inv(psi.T @ psi)
     assert largest_relative_error(covariance_of([psi], [v]), M @ psi.T @ R @ psi @ M) < 1e-9
+
+
+def test_in_a_loop_noise_passes_the_sensitivity_function():
+    # S has a zero at 1, from an integrating controller; the zero of the unstable plant at 1.25 is reflected to .8.
+    loop = SensitivityFunction.of(np.array([1.0, 1.25, 0.3]), np.array([0.9 + 0.2j, 0.9 - 0.2j, 0.0]))
+    psi, v = regressors(200), noise(np.random.default_rng(1), 200)
+    S = toeplitz(lfilter(np.poly([1.0, 0.8, 0.3]), np.poly(loop.poles), np.eye(200)[0]), np.zeros(200))
+    covariance, model = robust_covariance([psi], [S @ v], loop)
+    R, M = toeplitz(autocovariance(model, 200)), np.linalg.inv(psi.T @ psi)
+    # By the autoregression of v, with the sensitivities of its open loop.
+    own = fit_residual_noise([np.linalg.solve(S, psi)], [v])
+    np.testing.assert_allclose(model.coefficients, own.coefficients, atol=1e-6)
+    assert largest_relative_error(covariance, M @ psi.T @ S @ R @ S.T @ psi @ M) < 1e-6
 
 
 def test_white_residuals_give_the_white_formula():
