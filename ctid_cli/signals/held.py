@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.band_limited import finer_times, finer_values, values_between
-from ctid_cli.signals.checks import freeze, require_increasing
+from ctid_cli.signals.checks import freeze
+from ctid_cli.signals.data_checks import Rows, check_times
 from ctid_cli.signals.treatment import Hold as Hold
 
 #: Instants closer than this fraction of the shortest break interval count as the same instant: ``k * 0.05`` and
@@ -67,9 +68,9 @@ class HeldSignal:
             raise DataError(f"a held signal needs times and values of one equal, non-zero length; got {shapes}")
         if self.hold not in get_args(Hold):
             raise DataError(f"hold must be 'zoh', 'foh' or 'band-limited', not {self.hold!r}")
-        if not (np.isfinite(t).all() and np.isfinite(values).all()):
-            raise DataError("the input holds a value or a time that is not a finite number")
-        require_increasing("input times", t)
+        if not np.isfinite(values).all():
+            raise DataError(f"{Rows().at(int(np.argmin(np.isfinite(values))))}the input is not a finite number")
+        check_times(t, "the time of the input", Rows())
         if self.hold == "band-limited" and regular_interval(t) is None:
             raise DataError("a band-limited input needs a regular clock; take straight lines between its samples (foh)")
         freeze(self, t=t, values=values)

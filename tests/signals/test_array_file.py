@@ -128,7 +128,7 @@ def test_iddata_is_answered_with_the_line_that_exports_it(rig, version):
 
 def test_the_line_is_given_where_the_arrays_beside_an_object_do_not_suffice(rig):
     save_beside_object(rig, {"t": T})
-    with pytest.raises(DataError, match="no variable is called 'u' or 'input'") as error:
+    with pytest.raises(DataError, match="a record needs a time, an input and an output") as error:
         read_measurement(rig)
     assert LINE in str(error.value)
 
@@ -150,7 +150,7 @@ def test_other_objects_are_named(rig):
         ({"t": T, "u": U[:4], "y": Y}, {}, "'u' has 4 values and 'y' has 5; they must be equally many"),
         ({"t": T[:4], "u": U, "y": Y}, {}, "'t' has 4 values and 'y' has 5"),
         ({"t": T[::-1], "u": U, "y": Y}, {}, "sample 2: time 't' goes back to 0.3 s after 0.4 s on sample 1"),
-        ({"t": T, "u": U, "y": Y * np.nan}, {}, "sample 1: no sample of the output 'y' is a finite number"),
+        ({"t": T, "u": U, "y": Y * np.nan}, {}, "sample 1: no sample of output 'y' is a finite number"),
         ({"t": T, "valve": U, "y": Y}, {}, "no variable is called 'u' or 'input'; the file has 't', 'valve', 'y'"),
         ({"valve": U}, {"input": "valv"}, "there is no variable 'valv'; the file has 'valve'. Did you mean 'valve'?"),
         ({"Ts": -0.1, "u": U, "y": Y}, {}, "'Ts' is -0.1; a sampling interval must be a positive number"),

@@ -141,12 +141,15 @@ def test_sound(tmp_path):
 def test_other_refusals(tmp_path):
     with pytest.raises(DataError, match="does not exist"):
         read_sampled_signal(tmp_path / "none.csv")
-    with pytest.raises(DataError, match="no sample of 'y'"):
+    with pytest.raises(DataError, match="no sample of signal 'y'"):
         read_sampled_signal(write(tmp_path / "a.csv", (np.arange(9.0), np.full(9, np.nan)), "t,y"))
 
 
 def test_without_soundfile_it_is_said_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "soundfile", None)
     (tmp_path / "a.flac").write_bytes(b"fLaC")
-    with pytest.raises(DataError, match=r"with the package soundfile: pip install 'ctid\[sound\]' .* \(\.csv\)"):
+    with pytest.raises(
+        DataError,
+        match=r"FLAC files are read with .* pip install 'ctid\[sound\]', or",
+    ):
         read_sampled_signal(tmp_path / "a.flac")
