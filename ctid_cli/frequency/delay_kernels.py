@@ -90,51 +90,42 @@ def rounding_of(gram: Array, theta: Array) -> float:
 
 
 @njit(cache=True, nogil=True)
-def factorise(gram: Array, ridge: float) -> tuple[bool, Array, Array]:
-    """Return success, the Cholesky factor of the second moments scaled to a unit diagonal, and the scales."""
-    n = len(gram) - 1
-    # A unit diagonal makes the pivots below comparable with rounding, for any units of the columns.
-    factor, scales = np.zeros((n, n)), np.sqrt(np.diag(gram)[:n])
+def solve(gram: Array, ridge: float, columns: Array) -> bool:
+    """Solve ``G X = B`` in place for the second moments G of the regressors; return False if they are singular."""
+    n = len(columns)
+    scales = np.sqrt(np.diag(gram)[:n])
     if not (np.isfinite(scales) & (scales > 0.0)).all():
-        return False, factor, scales
-    for i in range(n):
-        for j in range(i + 1):
-            total = gram[i, j] / (scales[i] * scales[j])
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            if i > j:
-                factor[i, j] = total / factor[j, j]
-            elif total + ridge > 4e-16 * n:
-                factor[i, i] = np.sqrt(total + ridge)
-            else:
-                # The remainder of a linearly dependent column is rounding error: not positive definite.
-                return False, factor, scales
-    return True, factor, scales
-
-
-@njit(cache=True, nogil=True)
-def substitute(factor: Array, scales: Array, values: Array) -> None:
-    """Solve ``S L L' S x = b`` in place, with S the scales."""
-    n = values.size
-    values /= scales
-    for i in range(n):
-        for k in range(i):
-            values[i] -= factor[i, k] * values[k]
-        values[i] /= factor[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            values[i] -= factor[k, i] * values[k]
-        values[i] /= factor[i, i]
-    values /= scales
+        return False
+    # A unit diagonal makes the pivots comparable with rounding, for any units of the regressors.
+    matrix = gram[:n, :n] / np.outer(scales, scales)
+    for k in range(n):
+        columns[k] /= scales[k]
+        matrix[k, k] += ridge
+    for k in range(n):
+        # The remainder of a linearly dependent column is rounding error.
+        if not matrix[k, k] > 4e-16 * n:
+            return False
+        for i in range(k + 1, n):
+            factor = matrix[i, k] / matrix[k, k]
+            for j in range(k + 1, n):
+                matrix[i, j] -= factor * matrix[k, j]
+            columns[i] -= factor * columns[k]
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            columns[k] -= matrix[k, j] * columns[j]
+        columns[k] /= matrix[k, k]
+    for k in range(n):
+        columns[k] /= scales[k]
+    return True
 
 
 @njit(cache=True, nogil=True)
 def least_squares(gram: Array, ridge: float, theta: Array) -> bool:
     """Compute the least-squares parameters; return False if the second moments do not determine them."""
-    determined, factor, scales = factorise(gram, ridge)
+    solution = gram[:-1, -1:].copy()
+    determined = solve(gram, ridge, solution)
     if determined:
-        theta[:] = gram[theta.size, : theta.size]
-        substitute(factor, scales, theta)
+        theta[:] = solution[:, 0]
     return determined
 
 
@@ -186,12 +177,8 @@ def decode(theta: Array, clock: Clock, roots: Array, omega: Array) -> int:
         omega[:] = np.nan
         return COMPLEX_ROOTS
     if not real_roots(theta, roots):
-        # Real parts of the eigenvalues of the companion matrix.
         flags = COMPLEX_ROOTS
-        companion = np.zeros((n, n), np.complex128)
-        companion[0] = -theta
-        companion[1:, : n - 1] = np.eye(n - 1)
-        roots[:] = np.linalg.eigvals(companion).real
+        roots[:] = np.roots(np.append(1.0, theta).astype(np.complex128)).real
     # The largest cosine belongs to the lowest frequency, and clipping preserves the order.
     if n > 2 or flags:
         roots[:] = np.sort(roots)[::-1]
@@ -238,27 +225,28 @@ def flag_uncertain(
     error is multiplied by ``(period/span)^5``. This also applies to the first two periods; later a misfit is reliable,
     even if the estimate is from fewer samples.
     """
-    determined, factor, scales = factorise(gram, 0.0)
-    if not determined:
-        return UNDETERMINED
-    n, misfit, rounded = theta.size, squared_residual(gram, theta), rounding_of(gram, theta)
-    if misfit < DETERMINED * rounded:
-        misfit = min(left, max(misfit, rounded))
-    spacings = spacings_of(omega)
+    n = theta.size
+    # d c_i/d theta_k = -c_i^(n-k)/prod_j(c_i - c_j), and w = arccos(c)/h.
+    slopes = np.empty((n, n))
     for i in range(n):
-        # d c_i/d theta_k = -c_i^(n-k)/prod_j(c_i - c_j), and w = arccos(c)/h.
         others = roots[i] - roots
         others[i] = clock.delay * np.sqrt(max(1.0 - roots[i] * roots[i], 0.0))
-        slopes = roots[i] ** np.arange(n - 1, -1, -1) / np.prod(others)
-        direction = slopes.copy()
-        substitute(factor, scales, direction)
-        error = np.sqrt(max(np.sum(direction * slopes), 0.0) * misfit)
+        slopes[:, i] = roots[i] ** np.arange(n - 1, -1, -1) / np.prod(others)
+    directions = slopes.copy()
+    if not solve(gram, 0.0, directions):
+        return UNDETERMINED
+    misfit, rounded = squared_residual(gram, theta), rounding_of(gram, theta)
+    if misfit < DETERMINED * rounded:
+        misfit = min(left, max(misfit, rounded))
+    errors = np.sqrt(np.maximum(np.sum(slopes * directions, axis=0), 0.0) * misfit)
+    spacings, sizes = spacings_of(omega), np.sqrt(np.diag(gram)[:n])
+    for i in range(n):
         periods = spacings[i] * min(span, elapsed / FIRST_PERIODS) / (2.0 * np.pi)
         if periods < 1.0:
-            error /= max(periods, 1e-30) ** 5
+            errors[i] /= max(periods, 1e-30) ** 5
         # Rounding does not depend on the time span. Equal roots give NaN.
-        rounding = np.sqrt(ROUNDING * rounded) * np.sum(np.abs(direction) * scales)
-        if not error + rounding <= CERTAIN_FRACTION * spacings[i]:
+        rounding = np.sqrt(ROUNDING * rounded) * np.sum(np.abs(directions[:, i]) * sizes)
+        if not errors[i] + rounding <= CERTAIN_FRACTION * spacings[i]:
             return UNCERTAIN
     return 0
 
