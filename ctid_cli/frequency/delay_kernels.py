@@ -103,7 +103,7 @@ def solve(gram: Array, ridge: float, columns: Array) -> bool:
         matrix[k, k] += ridge
     for k in range(n):
         # The remainder of a linearly dependent column is rounding error.
-        if not matrix[k, k] > 4e-16 * n:
+        if not matrix[k, k] > 1e-15 * n:
             return False
         for i in range(k + 1, n):
             factor = matrix[i, k] / matrix[k, k]

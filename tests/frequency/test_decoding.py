@@ -5,7 +5,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ctid_cli.frequency.delay_kernels import flag_uncertain, lasts_a_period, real_roots
+from ctid_cli.frequency.delay_kernels import flag_uncertain, real_roots
 from ctid_cli.frequency.delay_regression import theta_of
 from ctid_cli.frequency.flags import Flag
 from tests.frequency.signals import clock_of, frequencies_of
@@ -47,12 +47,6 @@ def test_real_roots_are_found_and_complex_ones_are_not(n, seed):
     omega, flags = frequencies_of(coefficients[1:], 1.0)
     assert flags == Flag.COMPLEX_ROOTS
     np.testing.assert_allclose(np.cos(omega), np.sort(np.roots(coefficients).real)[::-1], atol=1e-6)
-
-
-def test_double_roots_are_real_or_nearly():
-    for n in (2, 3, 5):
-        omega, _ = frequencies_of(np.poly(np.full(n, 0.3))[1:], 1.0)
-        np.testing.assert_allclose(np.cos(omega), 0.3, atol=10 * 1e-16 ** (1 / n))
 
 
 def test_roots_that_are_no_cosines_are_clipped_and_flagged():
@@ -116,19 +110,6 @@ def test_rounding_counts_where_moments_are_nearly_singular():
     assert verdict([2.0, 3.0], 0.0, closeness=1e-3) == 0
     assert verdict([2.0, 3.0], 0.0, closeness=1e-7) == Flag.UNCERTAIN
     assert verdict([2.0, 3.0], 0.0, closeness=1e-9) == Flag.UNDETERMINED
-
-
-def test_coincident_frequencies_are_uncertain():
-    x = np.random.default_rng(0).standard_normal((50, 3))
-    roots = np.array([0.3, 0.3])
-    omega, theta = np.arccos(roots) / 0.7, np.poly(roots)[1:]
-    assert flag_uncertain(x.T @ x, 0.0, theta, roots, omega, clock_of(0.7), LONG, LONG) == Flag.UNCERTAIN
-
-
-def test_a_period_is_one_of_every_frequency_and_of_every_beat():
-    for omega in ([1.0, 3.0], [4.0, 5.0], [5.0, 6.0]):
-        assert not lasts_a_period(np.array(omega), 2 * np.pi - 1e-6)
-        assert lasts_a_period(np.array(omega), 2 * np.pi + 1e-6)
 
 
 def test_every_flag_has_a_sentence():

@@ -89,13 +89,6 @@ def test_of_two_structs_one_must_be_chosen(rig):
     assert np.array_equal(chosen.record.input.values, -U)
 
 
-def test_numbers_of_other_types_are_converted_and_names_may_be_given(rig):
-    scipy.io.savemat(rig, {"k": np.arange(5, dtype=np.int32), "valve": U.astype(np.float32), "level": Y})
-    measurement = read_measurement(rig, time="k", input="valve", output="level", start=1, stop=3)
-    assert measurement.record.t.tolist() == [1.0, 2.0, 3.0]
-    assert measurement.record.input.values.tolist() == [-1.0, 1.0, 1.0]
-
-
 # --- refused files --------------------------------------------------------------------------------
 
 LINE = (
@@ -131,12 +124,6 @@ def test_the_line_is_given_where_the_arrays_beside_an_object_do_not_suffice(rig)
     with pytest.raises(DataError, match="a record needs a time, an input and an output") as error:
         read_measurement(rig)
     assert LINE in str(error.value)
-
-
-def test_other_objects_are_named(rig):
-    rig.write_bytes(opaque(b"tt", b"timetable"))
-    with pytest.raises(DataError, match=r"'tt' is a MATLAB timetable object.*save\('rig\.mat', 't', 'u', 'y', '-v7'\)"):
-        read_measurement(rig)
 
 
 @pytest.mark.parametrize(

@@ -80,9 +80,3 @@ def test_one_late_sample_makes_a_clock_irregular(samples, shift, data):
     t = np.arange(samples, dtype=float)
     t[late] += shift
     assert regular_interval(t) is None
-
-
-def test_times_written_with_few_digits_are_still_regular():
-    # A file with ten digits after the point, as written by loggers.
-    t = np.round(np.arange(1000) / 300, 10)
-    assert regular_interval(t) == pytest.approx(1 / 300, rel=1e-9)

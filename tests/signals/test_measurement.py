@@ -8,14 +8,6 @@ from ctid_cli.signals.measurement import read_measurement
 # --- accepted files -------------------------------------------------------------------------------
 
 
-def test_units_in_the_header_are_labels_and_convert_nothing(write):
-    path = write("Time [ms],Input (V),Output [m/s (rms)]\n0,1,5\n10,2,6\n20,3,7\n")
-    measurement = read_measurement(path)
-    assert (measurement.time_unit, measurement.input_unit, measurement.output_unit) == ("ms", "V", "m/s (rms)")
-    assert measurement.record.t.tolist() == [0.0, 10.0, 20.0]
-    assert measurement.time == "Time [ms]"
-
-
 def test_columns_by_name_with_or_without_their_unit(write):
     path = write("note,valve [%],clock [min],level\na,5,0,1\nb,6,1,2\n")
     for valve in ("valve", "valve [%]"):
@@ -54,11 +46,6 @@ def test_what_is_wrong_outside_the_window_does_not_matter(write):
     assert read_measurement(path, stop=1).record.n_samples == 2
     with pytest.raises(DataError, match=r"pump\.csv:4: input 'u' is missing"):
         read_measurement(path, start=1)
-
-
-def test_other_text_files_are_read_alike(write):
-    for name in ("pump.txt", "pump.dat", "pump.tsv", "pump", "PUMP.CSV"):
-        assert read_measurement(write("t,u,y\n0,1,2\n1,3,4\n", name)).record.n_samples == 2
 
 
 # --- refused files --------------------------------------------------------------------------------

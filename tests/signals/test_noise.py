@@ -93,13 +93,6 @@ def test_levels_scale_one_shape(snr_db, replicate):
             assert np.array_equal(noise.generate(OUTPUT[:80], rng(replicate)), drawn[:80])
 
 
-def test_no_noise_draws_as_much():
-    generator, same = rng(), rng()
-    assert not WhiteNoise(standard_deviation=0.0).generate(OUTPUT, generator).any()
-    same.standard_normal(OUTPUT.size)
-    assert generator.random() == same.random()
-
-
 @pytest.mark.parametrize("noise", [WhiteNoise(snr_db=10.0), ArmaNoise((1.0,), (1.0, -0.5), snr_db=10.0)])
 def test_a_ratio_needs_an_output(noise):
     with pytest.raises(DataError, match="noise-free output is zero"):

@@ -19,6 +19,7 @@ from ctid_cli.specification.sections import geometric_sizes
 
 BAND = {"lowest_frequency": 1.0, "highest_frequency": 2.0}
 NAN = float("nan")
+UNIT = {"numerator": (1.0,), "denominator": (1.0,), "variance": 1.0}
 
 
 def has_check(hint):
@@ -69,23 +70,11 @@ def test_every_option_has_a_check():
         (WhiteNoise, {"snr_db": 5.0, "standard_deviation": 1.0}, "snr_db and standard_deviation were given"),
         (WhiteNoise, {"variance": -0.1}, r"variance must be zero or a positive number \[output unit\^2\], not -0.1"),
         (WhiteNoise, {"snr_db": 2000}, "snr_db must be within plus or minus 1000 dB"),
-        (
-            ArmaNoise,
-            {"numerator": (1.0,), "denominator": (1.0,)},
-            "variance .*, innovation_variance .*; none was given",
-        ),
-        (
-            ArmaNoise,
-            {"numerator": (1.0,), "denominator": (1.0, -1.0), "variance": 1.0},
-            "denominator has a zero of magnitude 1: the",
-        ),
-        (
-            ArmaNoise,
-            {"numerator": (1.0,), "denominator": (0.0, 1.0)},
-            "the first coefficient of denominator, which belongs",
-        ),
-        (ArmaNoise, {"numerator": (), "denominator": (1.0,), "variance": 1.0}, "the first coefficient of numerator"),
-        (ArmaNoise, {"numerator": (1.0, NAN), "denominator": (1.0,)}, "each of the numerator must be a finite"),
+        (ArmaNoise, {"numerator": (1.0,), "denominator": (1.0,)}, "innovation_variance .*; none was given"),
+        (ArmaNoise, UNIT | {"denominator": (1.0, -1.0)}, "denominator has a zero of magnitude 1: the noise would grow"),
+        (ArmaNoise, UNIT | {"denominator": (0.0, 1.0)}, "the first coefficient of denominator, which belongs"),
+        (ArmaNoise, UNIT | {"numerator": ()}, "the first coefficient of numerator, which belongs"),
+        (ArmaNoise, UNIT | {"numerator": (1.0, NAN)}, "each of the numerator must be a finite"),
         (UniformIntervals, {"low": 0.2, "high": 0.1, "samples": 10}, "must not exceed high; they are 0.2 s and 0.1 s"),
         (IrregularSampling, {"interval": 0.1, "samples": 9, "spread": 1.0}, r"above 0 and below 1 \[-\], not 1.0"),
         (JitteredSampling, {"interval": 0.1, "samples": 9, "largest_shift": 0.05}, r"than half the interval, 0\.05 s"),
@@ -103,8 +92,3 @@ def test_every_option_has_a_check():
 def test_impossible_options_are_refused(make, options, message):
     with pytest.raises(ValueError, match=message):
         make(**options)
-
-
-def test_lists_become_tuples():
-    assert Steps([0], [1]) == Steps((0,), (1,))
-    assert Multisine(frequencies=[1.0]).frequencies == (1.0,)

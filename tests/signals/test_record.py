@@ -17,15 +17,6 @@ class Proportional:
     denominator = (1.0,)
 
 
-def test_masked_samples_are_counted_and_marked():
-    record = Record([0.0, 1.0, 2.5], [1.0, np.nan, 3.0], ONE)
-    assert record.n_samples == 3
-    assert record.duration == 2.5
-    assert record.valid.tolist() == [True, False, True]
-    assert record.interval is None
-    assert Record([0.0], [1.0], ONE).interval is None
-
-
 def test_input_is_on_the_grid_only_if_every_break_is():
     t = 0.1 * np.arange(10)
     u = np.arange(10.0)
@@ -96,9 +87,3 @@ def in_loop(t=T, u=T, hold="zoh", reference=(1.0, 2.0, 3.0, 4.0, 5.0), **more):
 def test_impossible_loops_are_refused(options, message):
     with pytest.raises(DataError, match=message):
         in_loop(**options)
-
-
-def test_a_reference_enters_in_one_of_two_places():
-    assert in_loop().loop.enters == "controller"
-    with pytest.raises(ValueError, match="enters must be 'controller' or 'input', not 'output'"):
-        in_loop(enters="output")

@@ -4,7 +4,6 @@ import sys
 
 import numpy as np
 import pytest
-import scipy.io
 from scipy.io import wavfile
 
 from ctid_cli.errors import DataError
@@ -17,14 +16,6 @@ def write(file, columns, header):
     rows = zip(*columns, strict=True)
     file.write_text("\n".join([header, *(",".join(f"{v:.9g}" for v in row) for row in rows)]) + "\n", encoding="utf-8")
     return file
-
-
-@pytest.mark.parametrize("header", ["t,y", "time,signal", "Time [s],sound (V)", "t,pressure"])
-def test_usual_names(tmp_path, header):
-    signal = read_sampled_signal(write(tmp_path / "a.csv", (5.0 + 0.1 * np.arange(50), Y), header))
-    assert signal.samples == pytest.approx(Y)
-    assert (signal.interval, signal.start) == (pytest.approx(0.1), pytest.approx(5.0))
-    assert signal.column in header
 
 
 def test_named_columns_and_units(tmp_path):
@@ -88,12 +79,6 @@ def test_of_two_times_one_must_be_chosen_unless_a_clock_is_given(tmp_path):
     assert read_sampled_signal(file, interval=0.1).samples == pytest.approx(Y)
 
 
-def test_two_columns_without_usual_names_are_taken_by_position(tmp_path):
-    signal = read_sampled_signal(write(tmp_path / "a.csv", (0.1 * np.arange(50), Y), "when,level"))
-    assert (signal.time, signal.column, signal.samples.tolist()) == ("when", "level", Y.tolist())
-    assert signal.notes == ("Columns were taken by their position: 'when' as the time and 'level' as the signal.",)
-
-
 def test_most_lines_may_be_missing_from_a_regular_clock(tmp_path):
     kept = np.flatnonzero(np.random.default_rng(0).random(2000) < 0.3)
     file = write(tmp_path / "a.csv", (0.1 * kept, np.sin(0.01 * kept)), "t,y")
@@ -112,14 +97,6 @@ def test_a_window(tmp_path):
     assert signal.samples == pytest.approx(Y[5:11])
     with pytest.raises(DataError, match="no sample lies after 90 s"):
         read_sampled_signal(file, start=90.0)
-
-
-def test_matlab_vectors(tmp_path):
-    file = tmp_path / "a.mat"
-    scipy.io.savemat(file, {"t": 0.1 * np.arange(50), "y": Y})
-    assert read_sampled_signal(file).interval == pytest.approx(0.1)
-    scipy.io.savemat(file, {"Ts": 0.2, "y": Y})
-    assert read_sampled_signal(file).interval == pytest.approx(0.2)
 
 
 def test_sound(tmp_path):
