@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Literal, NamedTuple, NoReturn, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -29,6 +29,8 @@ USUAL_NAMES: dict[str, tuple[str, ...]] = {
         *("amplitude", "data", "audio", "sound", "wave", "voltage"),
     ),
 }
+#: Layout of text files.
+LAYOUT = "The first line that is no comment must name the columns, separated by commas, semicolons, tabs or blanks"
 #: Names after which a slash precedes the unit; in other names the slash is part of the name.
 BEFORE_SLASH = {name for role in ROLES for name in USUAL_NAMES[role]}
 
@@ -175,7 +177,7 @@ class Table:
             contradicts = any(self._called(USUAL_NAMES[role], chosen) for role in roles)
             ordered = self.is_text or missing == ["signal"]
             if not ordered or len(self.names) != known or len(left) != len(missing) or contradicts:
-                self._refuse_unrecognised(missing[0], left, roles)
+                raise self._unrecognised(missing[0], left, roles)
             chosen.update(zip(missing, left, strict=True))
             taken = listed(f"{chosen[role]!r} as the {role}" for role in missing)
             notes.append(f"Columns were taken by their position: {taken}.")
@@ -190,9 +192,7 @@ class Table:
         matching = {name for name in self.names if split_header(name)[0] == wanted}
         if wanted in self.names or len(matching) == 1:
             return wanted if wanted in self.names else matching.pop()
-        close = closest(wanted, self.names)
-        parts = [f"{self.head}: there is no {self.noun} {wanted!r}; {self._listing}", *self._advice(close)]
-        raise DataError(". ".join(parts))
+        raise self._error(f"there is no {self.noun} {wanted!r}; {self._listing}", closest(wanted, self.names))
 
     def _called(self, usual: Sequence[str], chosen: Mapping[str, str]) -> list[str]:
         """Return the unused columns with the most specific of some names, ignoring case, unit and struct."""
@@ -208,19 +208,22 @@ class Table:
                 return near or matching
         return []
 
-    def _refuse_unrecognised(self, role: str, left: Sequence[str], roles: Sequence[str]) -> NoReturn:
-        needs = "a record needs a time, an input and an output" if "output" in roles else "a signal needs its times"
+    def _unrecognised(self, role: str, left: Sequence[str], roles: Sequence[str]) -> DataError:
+        """Return the error about a role without a column."""
         if len(self.names) < len(roles):
-            raise DataError(". ".join([f"{self.head}: {self._listing} and nothing else; {needs}", *self._advice(None)]))
+            needs = "a record needs a time, an input and an output" if "output" in roles else "a signal needs its times"
+            layout = f". {LAYOUT}" if self.is_text else ""
+            return self._error(f"{self._listing} and nothing else; {needs}{layout}", None)
         usual = " or ".join(map(repr, USUAL_NAMES[role][:2]))
         other = "other " if self._called(USUAL_NAMES[role], {}) else ""
         close = next((match for name in USUAL_NAMES[role][1:] if (match := closest(name, left))), None)
-        message = f"{self.head}: no {other}{self.noun} is called {usual}; {self._listing}"
-        raise DataError(". ".join([message, f"Say which one is the {role} (option {role})", *self._advice(close)]))
+        found = f"no {other}{self.noun} is called {usual}; {self._listing}"
+        return self._error(f"{found}. Say which one is the {role} (option {role})", close)
 
-    def _advice(self, close: str | None) -> list[str]:
-        """Return sentences about a column that is not found."""
-        return [*([f"Did you mean {close!r}?"] if close else []), *([self.hint] if self.hint and not close else [])]
+    def _error(self, problem: str, close: str | None) -> DataError:
+        """Return the error about a column that is not found."""
+        suggestion = f"Did you mean {close!r}?" if close else ""
+        return DataError(". ".join(filter(None, [f"{self.head}: {problem}", suggestion, self.hint])))
 
     def _require_seconds(self, name: str, wanted: str | None) -> None:
         unit = split_header(name)[1]

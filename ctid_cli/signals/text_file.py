@@ -41,7 +41,6 @@ NUMBERS = {
     for sign, mark in ((".", r"\."), (",", ","))
 }
 NO_DATA = "the file has a header and no data"
-NAMES = "The first line that is no comment must name the columns, separated by commas, semicolons, tabs or blanks"
 TEXT = "this is not a text file in UTF-8, or in UTF-16 with its mark"
 FORMATS = "records are read from text (.csv, .txt), MATLAB files (.mat) and HDF5 files (.h5)"
 
@@ -79,7 +78,7 @@ def read_text_table(path: str | os.PathLike[str]) -> Table:
     layout = _layout(path, file)
     names, head = tuple(filter(None, layout.columns)), f"{file}:{layout.header}"
     read = partial(_read_columns, layout)
-    return Table(file, names, read, head, hint=NAMES, is_text=True, notes=layout.notes, comments=layout.comments)
+    return Table(file, names, read, head, is_text=True, notes=layout.notes, comments=layout.comments)
 
 
 # --- first lines ----------------------------------------------------------------------------------
