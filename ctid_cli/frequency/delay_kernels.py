@@ -278,12 +278,12 @@ def flag_inconsistent(gram: Array, omega: Array, delay: float, negligible: float
 #: Negligible residual of the frequencies at the second delay, as a fraction of the regressand's second moment.
 MIXED_NEGLIGIBLE = 1e-4
 #: Time span of the residuals that check an estimate, as a multiple of n h.
-JUDGED_SPANS = 4
+CHECKED_SPANS = 4
 NEWEST, USUAL, LEFT = range(3)
-SINCE_VERDICT, VERDICT, SINCE_DOUBT, SINCE_CHANGE = range(4)
+SINCE_CHECK, RESULT, SINCE_UNCERTAIN, SINCE_CHANGE = range(4)
 
 
-class Judged(NamedTuple):
+class Checks(NamedTuple):
     """State of the checks of estimates."""
 
     #: Number of samples after which the effect of a change has ended.
@@ -296,17 +296,17 @@ class Judged(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def judge_rows(
-    theta: Array, rows: Array, grams: Array, counts: Array, clock: Clock, judged: Judged, omega: Array, flags: Flags
+def check_estimates(
+    theta: Array, rows: Array, grams: Array, counts: Array, clock: Clock, checks: Checks, omega: Array, flags: Flags
 ) -> None:
     """Decode estimates and flag unreliable ones by the moments of recent rows at both delays.
 
     ``counts`` contains, for each estimate, its number of recent rows (without any it is not checked), its number of
     samples, and the number of all samples so far; ``flags`` are the known flags, which are extended.
     """
-    n, before, levels, counters = theta.shape[1], judged.theta, judged.levels, judged.counters
+    n, before, levels, counters = theta.shape[1], checks.theta, checks.levels, checks.counters
     roots, interval = np.empty(n), clock.interval
-    smoothing, forgotten = 1.0 / max(1.0, DETECTOR_SPAN * clock.lag), 1.0 / (JUDGED_SPANS * n * clock.lag)
+    smoothing, forgotten = 1.0 / max(1.0, DETECTOR_SPAN * clock.lag), 1.0 / (CHECKED_SPANS * n * clock.lag)
     for k in range(len(theta)):
         omega[k] = np.nan
         if np.isnan(theta[k, 0]):
@@ -324,28 +324,28 @@ def judge_rows(
             levels[LEFT] += square - forgotten * levels[LEFT]
         # A contradicted estimate is checked at once, others at regular intervals.
         contradicted = started and levels[NEWEST] > levels[USUAL]
-        if counters[SINCE_VERDICT] == 0 or contradicted:
+        if counters[SINCE_CHECK] == 0 or contradicted:
             gram, check = grams[k, 0].copy(), grams[k, 1].copy()
-            verdict = flag_uncertain(gram, levels[LEFT], theta[k], roots, omega[k], clock, span, elapsed)
-            if contradicted or verdict:
-                verdict |= UNCERTAIN
+            result = flag_uncertain(gram, levels[LEFT], theta[k], roots, omega[k], clock, span, elapsed)
+            if contradicted or result:
+                result |= UNCERTAIN
                 levels[NEWEST] = 0.0
                 if started:
-                    counters[SINCE_DOUBT] = 0
+                    counters[SINCE_UNCERTAIN] = 0
                 if contradicted:
                     counters[SINCE_CHANGE] = 0
             # The window must not contain rows from before a change.
-            elif counters[SINCE_CHANGE] < judged.flush or not lasts_a_period(
-                omega[k], counters[SINCE_DOUBT] * interval
+            elif counters[SINCE_CHANGE] < checks.flush or not lasts_a_period(
+                omega[k], counters[SINCE_UNCERTAIN] * interval
             ):
-                verdict = UNCERTAIN
-            verdict |= flag_inconsistent(check, omega[k], clock.second_delay, MIXED_NEGLIGIBLE)
-            counters[VERDICT] = verdict
+                result = UNCERTAIN
+            result |= flag_inconsistent(check, omega[k], clock.second_delay, MIXED_NEGLIGIBLE)
+            counters[RESULT] = result
             misfit = max(squared_residual(gram, theta[k]), rounding_of(gram, theta[k]))
             levels[USUAL] = ALARM_RATIO * misfit / weight
-        counters[SINCE_VERDICT] = (counters[SINCE_VERDICT] + 1) % clock.every if started else 0
-        counters[SINCE_DOUBT:] += 1
-        flags[k] |= counters[VERDICT]
+        counters[SINCE_CHECK] = (counters[SINCE_CHECK] + 1) % clock.every if started else 0
+        counters[SINCE_UNCERTAIN:] += 1
+        flags[k] |= counters[RESULT]
 
 
 # --- least squares that restart when the signal changes ------------------------------------------------------------
@@ -364,7 +364,7 @@ EXACT = 1e-13
 NEGLIGIBLE = 1e-8
 OLDER, NEWER, CHECK = range(3)
 RESIDUAL, ALARM = 2, 3
-ROWS, NEXT, FLUSH, LAST_VERDICT = range(4)
+ROWS, NEXT, FLUSH, LAST_CHECK = range(4)
 
 
 class Restarting(NamedTuple):
@@ -395,7 +395,7 @@ class Fit(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def judge(gram: Array, theta: Array, omega: Array, clock: Clock, rows: float, age: float) -> tuple[int, bool]:
+def check_fit(gram: Array, theta: Array, omega: Array, clock: Clock, rows: float, age: float) -> tuple[int, bool]:
     """Compute the frequencies of a fit to the rows since a restart; return flags, and whether it can test new samples.
 
     It can if it is certain, or if it is too old for a starting misfit.
@@ -416,8 +416,8 @@ def drop_mixed_rows(clock: Clock, compared: int, fit: Fit) -> bool:
     if levels[OLDER] > 0.0 and least_squares(newer, 0.0, theta):
         # A fit to too few rows must not reject the others, unless it is exact.
         alone = squared_residual(newer, theta)
-        judges = judge(newer, theta, omega, clock, levels[NEWER], levels[NEWER])[1]
-        if (judges or alone <= EXACT * newer[-1, -1]) and least_squares(gram, 0.0, theta):
+        reliable = check_fit(newer, theta, omega, clock, levels[NEWER], levels[NEWER])[1]
+        if (reliable or alone <= EXACT * newer[-1, -1]) and least_squares(gram, 0.0, theta):
             together = squared_residual(gram, theta) - 1e-14 * gram[-1, -1]
             mixed = together / (levels[OLDER] + levels[NEWER]) > MIXED_RATIO * alone / levels[NEWER]
     if mixed:
@@ -440,7 +440,7 @@ def refresh(clock: Clock, whitener: Array, fit: Fit) -> None:
     n, theta, levels, counters = fit.theta.size, fit.theta, fit.levels, fit.counters
     gram, weight = fit.moments[OLDER] + fit.moments[NEWER], levels[OLDER] + levels[NEWER]
     # Tones that the rows do not resolve give a singular matrix; the last estimate is then kept with a flag.
-    counters[LAST_VERDICT] = UNDETERMINED
+    counters[LAST_CHECK] = UNDETERMINED
     if not least_squares(gram, 0.0, theta):
         return
     if whitener.size > 0:
@@ -450,11 +450,11 @@ def refresh(clock: Clock, whitener: Array, fit: Fit) -> None:
         theta[:] = -v[:n] / v[n:]
     # The lower limit prevents alarms by residuals of an exact fit, which are rounding.
     levels[ALARM] = (ALARM_RATIO * squared_residual(gram, theta) + ROUNDING_FLOOR * gram[n, n]) / weight
-    verdict, judges = judge(gram, theta, fit.omega, clock, weight, counters[ROWS])
-    if not judges:
+    result, reliable = check_fit(gram, theta, fit.omega, clock, weight, counters[ROWS])
+    if not reliable:
         levels[ALARM] = np.inf
     inconsistent = flag_inconsistent(fit.moments[CHECK], fit.omega, clock.second_delay, NEGLIGIBLE)
-    counters[LAST_VERDICT] = verdict | inconsistent
+    counters[LAST_CHECK] = result | inconsistent
 
 
 @njit(cache=True, nogil=True)
@@ -473,7 +473,7 @@ def restarting_fits(rows: Array, clock: Clock, settings: Restarting, fit: Fit, o
             if counters[ROWS] == 0:
                 # The first comparison needs an older half.
                 counters[NEXT] = settings.compared // 2
-                counters[LAST_VERDICT] = 0
+                counters[LAST_CHECK] = 0
                 moments[:] = 0.0
                 levels[: RESIDUAL + 1] = 0.0
             elif counters[ROWS] >= settings.armed:
@@ -500,4 +500,4 @@ def restarting_fits(rows: Array, clock: Clock, settings: Restarting, fit: Fit, o
         if counters[ROWS] < settings.enough and flag == 0:
             flag = STARTING
         omega[k] = own_omega
-        flags[k] = flag | counters[LAST_VERDICT]
+        flags[k] = flag | counters[LAST_CHECK]
