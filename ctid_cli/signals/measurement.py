@@ -146,7 +146,7 @@ def read_measurement(
         for name, role, own in zip(names, roles, holds, strict=True)
     }
     only_one = len(inputs) == 1
-    record = Record(t[used], columns.output(used), inputs["".join(names)] if only_one else inputs, name=file)
+    record = Record(t[used], columns.output(used), inputs[names[0]] if only_one else inputs, name=file)
     known: dict[str, Any] = {role: columns.names[role] for role in ROLES}
     known |= {f"{role}_unit": columns.unit(role) for role in ROLES}
     if not only_one:

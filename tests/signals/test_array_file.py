@@ -9,6 +9,8 @@ import scipy.io
 from scipy.io.matlab import MatlabObject
 
 from ctid_cli.errors import DataError
+from ctid_cli.signals import array_file
+from ctid_cli.signals.frequency_data import is_frequency_table
 from ctid_cli.signals.measurement import read_measurement
 
 T = 0.1 * np.arange(5)
@@ -166,3 +168,14 @@ def test_a_cut_file_is_refused_or_incomplete_but_never_a_traceback(rig):
         rig.write_bytes(whole[:length])
         with pytest.raises(DataError, match=r"rig\.mat"):
             read_measurement(rig)
+
+
+def test_looking_at_the_names_first_reads_the_file_once(rig, monkeypatch):
+    scipy.io.savemat(rig, COLUMNS)
+    read, files = array_file._read_in_own_process, []
+    monkeypatch.setattr(array_file, "_read_in_own_process", lambda file: files.append(file) or read(file))
+    assert not is_frequency_table(rig)
+    read_measurement(rig)
+    assert files == [str(rig)]
+    scipy.io.savemat(rig, COLUMNS | {"y": 2 * Y, "x": 1.0})
+    assert read_measurement(rig).record.y[1] == 2 * Y[1]

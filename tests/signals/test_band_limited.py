@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ctid_cli import HeldSignal, Record, TransferFunction, estimate_frequency_response, simulate
+from ctid_cli import HeldSignal, TransferFunction, simulate
 from ctid_cli.signals.band_limited import FINER, REACH, band_limited_doubt
 
 INTERVAL, PERIOD = 0.2, 400
@@ -86,14 +86,3 @@ def test_what_is_not_known_at_the_ends():
     doubt = band_limited_doubt(t, values)
     assert doubt.reach == pytest.approx(REACH * INTERVAL)
     assert 0.2 < doubt.ends / np.sqrt(np.mean(off**2)) < 5
-
-
-def test_the_frequency_response_of_a_band_limited_record_is_exact():
-    model = MODELS["resonant"]
-    w, phases = period(0.9)
-    t = INTERVAL * np.arange(3 * PERIOD)
-    u, y = waves(t, w, phases), waves(t, w, phases, exact(model, w))
-    found = estimate_frequency_response(Record(t, y, HeldSignal(t, u, "band-limited")))
-    assert found.frequencies == pytest.approx(w, rel=1e-9)
-    assert np.abs(found.response - exact(model, w)).max() < 1e-10 * np.abs(exact(model, w)).max()
-    assert not found.bias.any()

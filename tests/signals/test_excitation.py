@@ -6,10 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals.excitation import Gaussian, Gbn, InputFile, Prbs, Step, Steps, maximal_length_sequence
+from ctid_cli.signals.excitation import Gbn, InputFile, Prbs, Step, Steps, maximal_length_sequence
 from ctid_cli.signals.multisine import Multisine
 from ctid_cli.signals.noise import stream
-from ctid_cli.signals.sampling import UniformIntervals
 
 
 def rng(replicate=0):
@@ -108,21 +107,6 @@ def test_multisine_beyond_its_clock_is_refused():
 
 
 # --- Gaussian values, steps -----------------------------------------------------------------------
-
-
-def test_gaussian_has_its_moments():
-    values = Gaussian(standard_deviation=3.0).generate(np.arange(40_000.0), rng()).values
-    # Four standard errors of the mean and of the standard deviation.
-    assert abs(values.mean()) < 4 * 3 / 200
-    assert abs(values.std() - 3) < 4 * 3 / np.sqrt(80_000)
-
-
-@pytest.mark.parametrize("excitation", [Gaussian(), Multisine(1, 2, tones=3)])
-def test_without_a_clock_every_instant_has_a_value(excitation):
-    times = UniformIntervals(0.01, 0.09, 100).times(rng())
-    signal = excitation.generate(times, rng())
-    assert np.array_equal(signal.t, times)
-    assert np.unique(signal.values).size == 100
 
 
 @pytest.mark.parametrize(

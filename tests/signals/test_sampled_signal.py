@@ -72,13 +72,6 @@ def test_time_stamps_are_refused_unless_a_clock_is_given(tmp_path):
     assert read_sampled_signal(file, interval=0.1).samples == pytest.approx(Y)
 
 
-def test_of_two_times_one_must_be_chosen_unless_a_clock_is_given(tmp_path):
-    file = write(tmp_path / "a.csv", (0.1 * np.arange(50), np.arange(50), Y), "t [s],t [ms],y")
-    with pytest.raises(DataError, match=r"a.csv:1: 't \[s\]' and 't \[ms\]' may all be the time; say which one"):
-        read_sampled_signal(file)
-    assert read_sampled_signal(file, interval=0.1).samples == pytest.approx(Y)
-
-
 def test_most_lines_may_be_missing_from_a_regular_clock(tmp_path):
     kept = np.flatnonzero(np.random.default_rng(0).random(2000) < 0.3)
     file = write(tmp_path / "a.csv", (0.1 * kept, np.sin(0.01 * kept)), "t,y")
