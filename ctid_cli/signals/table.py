@@ -157,10 +157,10 @@ class Table:
 
     def _choose(self, wanted: Mapping[str, str | None], optional: str) -> tuple[dict[str, str], list[str]]:
         """Return the column of each role, and the assumptions made."""
-        chosen = {role: self.named(name) for role, name in wanted.items() if name is not None}
-        notes = []
+        named = {role: self.named(name) for role, name in wanted.items() if name is not None}
         # Other roles, such as a reference, have no usual names.
         roles = [role for role in wanted if role in USUAL_NAMES]
+        chosen, notes = {role: named[role] for role in roles if role in named}, []
         for role in roles:
             if role in chosen:
                 continue
@@ -181,6 +181,7 @@ class Table:
             chosen.update(zip(missing, left, strict=True))
             taken = listed(f"{chosen[role]!r} as the {role}" for role in missing)
             notes.append(f"Columns were taken by their position: {taken}.")
+        chosen |= named
         unused = [repr(name) for name in self.names if name not in chosen.values()]
         if unused and self.is_text:
             what, verb = ("Column", "is") if len(unused) == 1 else ("Columns", "are")
