@@ -190,9 +190,14 @@ class Table:
 
     def named(self, wanted: str) -> str:
         """Return the column whose header is ``wanted``, with or without its unit."""
-        matching = {name for name in self.names if split_header(name)[0] == wanted}
-        if wanted in self.names or len(matching) == 1:
-            return wanted if wanted in self.names else matching.pop()
+        if wanted in self.names:
+            return wanted
+        matching = list(dict.fromkeys(name for name in self.names if split_header(name)[0] == wanted))
+        if len(matching) == 1:
+            return matching[0]
+        if matching:
+            several = listed(map(repr, matching))
+            raise DataError(f"{self.head}: {several} are all called {wanted!r}; give the name with its unit")
         raise self._error(f"there is no {self.noun} {wanted!r}; {self._listing}", closest(wanted, self.names))
 
     def _called(self, usual: Sequence[str], chosen: Mapping[str, str]) -> list[str]:

@@ -55,6 +55,7 @@ def test_what_is_wrong_outside_the_window_does_not_matter(write):
     ("text", "options", "message"),
     [
         ("t,u,y\n0,1,2\n1,1,2\n", {"input": "valv"}, ":1: there is no column 'valv'; the file has 't', 'u', 'y'"),
+        ("t,u [V],u [mV],y\n0,1,2,3\n", {"input": "u"}, "'u [V]' and 'u [mV]' are all called 'u'; give the name with"),
         ("t,valve,y\n0,1,2\n", {"input": "Valv"}, "Did you mean 'valve'?"),
         ("t,u,y\n0,1,2\n", {"input": "y", "output": "y"}, ":1: 'y' cannot be both the input and the output"),
         ("t,u,y\n0,1,2\n", {"input": "y"}, ":1: no other column is called 'y' or 'output'; the file has 't', 'u', 'y'"),
