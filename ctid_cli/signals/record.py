@@ -231,7 +231,13 @@ class Record:
         return [self.of_input(name) for name in self.held]
 
     def of_input(self, name: str) -> Record:
-        """Return the record with only one of its inputs, selected by name."""
+        """Return the record with only one of its inputs.
+
+        Parameters
+        ----------
+        name : str
+            Name of the input.
+        """
         return replace(self, inputs={name: self.held[name]}) if self.several else self
 
     @property
