@@ -41,7 +41,7 @@ class Rows:
 def check_times(t: Array, what: str, rows: Rows, unit: str = "s") -> None:
     """Refuse instants that are missing, do not increase, or are unsuitable for computation."""
     _refuse(~np.isfinite(t), f"{what} is missing or not finite; every sample needs its instant [{unit}]", rows)
-    _require_scale(t, what, rows, LONGEST)
+    require_scale(t, what, rows, LONGEST)
     steps = np.diff(t)
     if not steps.size:
         return
@@ -51,13 +51,15 @@ def check_times(t: Array, what: str, rows: Rows, unit: str = "s") -> None:
         found = f"{how} {t[k + 1]:.12g} {unit} after {t[k]:.12g} {unit} on {rows.row(k)}"
         raise DataError(f"{rows.at(k + 1)}{what} {found}; times must increase strictly")
     k = int(np.argmin(steps))
-    require_step(float(steps[k]), f"{rows.at(k + 1)}{what}")
+    if steps[k] < 1.0 / LONGEST:
+        least = f"give it in a unit in which it is at least {1 / LONGEST:g}"
+        raise DataError(f"{rows.at(k + 1)}{what} advances by {steps[k]:.3g}; {least}")
 
 
 def check_input(u: Array, what: str, rows: Rows) -> None:
     """Refuse missing values, since the system also responds to values that were not recorded."""
     _refuse(~np.isfinite(u), f"{what} is missing or not finite; only the output may have gaps", rows)
-    _require_scale(u, what, rows)
+    require_scale(u, what, rows)
 
 
 def check_output(y: Array, what: str, rows: Rows) -> None:
@@ -65,13 +67,7 @@ def check_output(y: Array, what: str, rows: Rows) -> None:
     _refuse(np.isinf(y), f"{what} is infinite; missing samples are NaN, or empty fields of a file", rows)
     if not np.isfinite(y).any():
         raise DataError(f"{rows.at(0)}no sample of {what} is a finite number")
-    _require_scale(y, what, rows)
-
-
-def require_step(step: float, what: str) -> None:
-    """Refuse a clock that is too fast for computation."""
-    if step < 1.0 / LONGEST:
-        raise DataError(f"{what} advances by {step:.3g}; give it in a unit in which it is at least {1 / LONGEST:g}")
+    require_scale(y, what, rows)
 
 
 def _refuse(wrong: BoolArray, message: str, rows: Rows) -> None:
@@ -80,7 +76,7 @@ def _refuse(wrong: BoolArray, message: str, rows: Rows) -> None:
         raise DataError(f"{rows.at(int(np.argmax(wrong)))}{message}")
 
 
-def _require_scale(values: Array, what: str, rows: Rows, largest: float = LARGEST) -> None:
+def require_scale(values: Array, what: str, rows: Rows, largest: float = LARGEST) -> None:
     """Refuse a signal whose unit makes it too small or too large for computation; zeros are allowed."""
     sizes = np.abs(values)
     found = float(np.nanmax(sizes))

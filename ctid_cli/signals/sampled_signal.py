@@ -10,7 +10,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import require_positive
-from ctid_cli.signals.data_checks import Rows, check_output, check_times
+from ctid_cli.signals.data_checks import LONGEST, Rows, check_output, require_scale
 from ctid_cli.signals.measurement import open_table
 from ctid_cli.signals.sound import is_sound, read_sound
 from ctid_cli.signals.table import Columns, Table, split_header
@@ -93,7 +93,7 @@ def read_sampled_signal(
     elif times is not None:
         notes.append(f"The times {times!r} are not used, since the sampling interval was given.")
         times = None
-    check_times(np.array([0.0, interval]), "the clock", columns.rows)
+    require_scale(np.array([interval]), "the clock", Rows(table.file), LONGEST)
     used = slice(0, values.size)
     if start is not None or stop is not None:
         instants = first + interval * np.arange(values.size, dtype=float)

@@ -40,6 +40,9 @@ def test_a_file_without_times(tmp_path):
         read_sampled_signal(file)
     signal = read_sampled_signal(file, interval=0.25)
     assert (signal.interval, signal.start, signal.time) == (0.25, 0.0, None)
+    assert read_sampled_signal(write(tmp_path / "one.csv", (Y[1:2],), "y"), interval=0.25).samples.tolist() == [Y[1]]
+    with pytest.raises(DataError, match="the clock is at most 1e-30; give it in a unit"):
+        read_sampled_signal(file, interval=1e-30)
     with pytest.raises(ValueError, match="interval"):
         read_sampled_signal(file, interval=0.0)
 
