@@ -89,33 +89,39 @@ def rounding_of(gram: Array, theta: Array) -> float:
     return float(ROUNDING * (sizes[-1] + np.sum(np.abs(theta) * sizes[:-1])) ** 2)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve(gram: Array, ridge: float, columns: Array) -> bool:
     """Solve ``G X = B`` in place for the second moments G of the regressors; return False if they are singular."""
-    n = len(columns)
-    scales = np.sqrt(np.diag(gram)[:n])
-    if not (np.isfinite(scales) & (scales > 0.0)).all():
-        return False
-    # A unit diagonal makes the pivots comparable with rounding, for any units of the regressors.
-    matrix = gram[:n, :n] / np.outer(scales, scales)
-    for k in range(n):
-        columns[k] /= scales[k]
-        matrix[k, k] += ridge
+    n, count = columns.shape
+    matrix, scales = np.empty((n, n)), np.empty(n)
+    for i in range(n):
+        scales[i] = np.sqrt(gram[i, i])
+        if not 0.0 < scales[i] < np.inf:
+            return False
+        # A unit diagonal makes the pivots comparable with rounding, for any units of the regressors.
+        for j in range(i + 1):
+            matrix[j, i] = gram[i, j] / (scales[i] * scales[j])
+        matrix[i, i] += ridge
+        for c in range(count):
+            columns[i, c] /= scales[i]
     for k in range(n):
         # The remainder of a linearly dependent column is rounding error.
         if not matrix[k, k] > 1e-15 * n:
             return False
         for i in range(k + 1, n):
-            factor = matrix[i, k] / matrix[k, k]
-            for j in range(k + 1, n):
+            factor = matrix[k, i] / matrix[k, k]
+            for j in range(i, n):
                 matrix[i, j] -= factor * matrix[k, j]
-            columns[i] -= factor * columns[k]
+            for c in range(count):
+                columns[i, c] -= factor * columns[k, c]
     for k in range(n - 1, -1, -1):
-        for j in range(k + 1, n):
-            columns[k] -= matrix[k, j] * columns[j]
-        columns[k] /= matrix[k, k]
+        for c in range(count):
+            for j in range(k + 1, n):
+                columns[k, c] -= matrix[k, j] * columns[j, c]
+            columns[k, c] /= matrix[k, k]
     for k in range(n):
-        columns[k] /= scales[k]
+        for c in range(count):
+            columns[k, c] /= scales[k]
     return True
 
 
