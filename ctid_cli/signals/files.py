@@ -16,6 +16,7 @@ MAX_LETTERS, MAX_NAMES = 24, 20
 #: Paths of transferred copies of files, by the SHA-256 of their content.
 COPIES: dict[str, str] = {}
 
+
 def require_file(path: str | os.PathLike[str], empty: str = " the file is empty") -> str:
     """Refuse anything but an ordinary file before it is opened: reading a pipe or a device may never end.
 

@@ -41,7 +41,7 @@ NUMBERS = {
     for sign, mark in ((".", r"\."), (",", ","))
 }
 NO_DATA = "the file has a header and no data"
-TEXT = "this is not a text file in UTF-8, or in UTF-16 with its mark"
+TEXT = "this is not a text file in UTF-8, or in UTF-16 with a byte order mark"
 FORMATS = "records are read from text (.csv, .txt), MATLAB files (.mat) and HDF5 files (.h5)"
 
 
@@ -313,5 +313,5 @@ def _instead_of_number(text: str, decimal: str) -> str:
     if NUMBERS[other].fullmatch(text):
         return f"a number with a decimal {name}, unlike the first {HEAD_LINES} lines; write all with one decimal sign"
     if NUMBERS[decimal].fullmatch(re.sub(rf"[{re.escape(other)}' \u00a0\u202f]", "", text)):
-        return "a number with marks between its digits; write it with digits and one decimal sign"
+        return "a number with separators between its digits; write it with digits and one decimal sign"
     return "not a number; leave the field empty if the sample is missing"

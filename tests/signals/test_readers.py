@@ -65,7 +65,7 @@ STRICTLY = "on line 3; times must increase strictly"
 INSTANT = "every sample needs its instant"
 KINDS = "records are read from text (.csv, .txt), MATLAB files (.mat) and HDF5 files (.h5)"
 DATE = "which is a date or a time of day; write times as numbers, such as seconds since the first sample"
-MARKS = "which is a number with marks between its digits; write it with digits and one decimal sign"
+MARKS = "which is a number with separators between its digits; write it with digits and one decimal sign"
 NUMBER = "which is not a number; leave the field empty if the sample is missing"
 NO_NAMES = ":1: the first line names no columns; it must name them, for example t,u,y"
 HUGE = "give it in a unit in which it is between"
@@ -95,7 +95,7 @@ REFUSED = {
     "no output": ("t,u,y\n0,1,\n1,1,nan\n", ":2: no sample of output 'y' is a finite number"),
     "huge numbers": ("t,u,y\n0,1,2\n1,1e300,2\n", f":3: input 'u' reaches 1e+300; {HUGE} 1e-60 and 1e+60"),
     "no text": (
-        b"\x89PNG\r\n\x1a\n\x00\x00", f": this is not a text file in UTF-8, or in UTF-16 with its mark; {KINDS}"),
+        b"\x89PNG\r\n\x1a\n\x00\x00", f": this is not a text file in UTF-8, or in UTF-16 with a byte order mark; {KINDS}"),
 }  # fmt: skip
 
 
