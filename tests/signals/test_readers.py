@@ -63,6 +63,7 @@ GAPS = "; only the output may have gaps"
 EMPTY = "; missing samples are NaN, or empty fields of a file"
 STRICTLY = "on line 3; times must increase strictly"
 INSTANT = "every sample needs its instant"
+NO_TEXT = "this is not a text file in UTF-8, or in UTF-16 with a byte order mark"
 KINDS = "records are read from text (.csv, .txt), MATLAB files (.mat) and HDF5 files (.h5)"
 DATE = "which is a date or a time of day; write times as numbers, such as seconds since the first sample"
 MARKS = "which is a number with separators between its digits; write it with digits and one decimal sign"
@@ -95,7 +96,7 @@ REFUSED = {
     "no output": ("t,u,y\n0,1,\n1,1,nan\n", ":2: no sample of output 'y' is a finite number"),
     "huge numbers": ("t,u,y\n0,1,2\n1,1e300,2\n", f":3: input 'u' reaches 1e+300; {HUGE} 1e-60 and 1e+60"),
     "no text": (
-        b"\x89PNG\r\n\x1a\n\x00\x00", f": this is not a text file in UTF-8, or in UTF-16 with a byte order mark; {KINDS}"),
+        b"\x89PNG\r\n\x1a\n\x00\x00", f": {NO_TEXT}; {KINDS}"),
 }  # fmt: skip
 
 
