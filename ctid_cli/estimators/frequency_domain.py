@@ -22,13 +22,12 @@ from ctid_cli.inference.residual_tests import all_white, chi_square_tail, normal
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty
 from ctid_cli.signals.frequency_data import FrequencyData
+from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offset, OutputHold
 
 #: p-value below which residuals count as larger than the given standard errors.
 MISFIT = 0.01
 #: Share of the squared weighted values below which residuals are rounding.
 ROUNDING = 1e-14
-#: Options of records in the time domain.
-OF_RECORDS = ("initial_state", "offset", "loss", "input_before", "noise_model", "inputs")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -166,10 +165,8 @@ class FrequencyDomain(DelayProfile):
         As in :class:`~ctid_cli.estimators.delay_profile.DelayProfile`.
     delay_bounds : tuple of float, default (0.0, 0.0)
         Least and greatest delay [s]; equal values fix the delay.
-    initial_state, offset, loss, input_before, noise_model, inputs
-        For records in the time domain only: must keep their defaults.
-    svf_cutoff, nested, hold_output, covariance, bootstrap_draws
-        Unused: smaller models are always fitted too, and standard errors are those of the lines.
+    inputs : None
+        For records in time only.
 
     Raises
     ------
@@ -193,6 +190,17 @@ class FrequencyDomain(DelayProfile):
     """
 
     delay_bounds: tuple[float, float] = (0.0, 0.0)
+    # Options of records in time, with their defaults: a frequency response has none of them.
+    initial_state: InitialState = field(init=False, default="rest")
+    offset: Offset = field(init=False, default="none")
+    loss: LossKind = field(init=False, default="squares")
+    svf_cutoff: float | None = field(init=False, default=None)
+    nested: bool = field(init=False, default=False)
+    hold_output: OutputHold = field(init=False, default="foh")
+    covariance: Covariance = field(init=False, default="auto")
+    bootstrap_draws: int = field(init=False, default=DRAWS)
+    input_before: InputBefore = field(init=False, default=None)
+    noise_model: str = field(init=False, default="white")
 
     def prepare(self, record: Any) -> Prepared[MeasuredRecords, MeasuredFit]:
         """Check and prepare a frequency response; a DataError states why estimation is impossible.
@@ -201,9 +209,8 @@ class FrequencyDomain(DelayProfile):
         """
         if not isinstance(record, FrequencyData):
             return super().prepare(record)
-        for name in OF_RECORDS:
-            if getattr(self, name) != next(each.default for each in fields(self) if each.name == name):
-                raise OptionError(name, f"{name} is for records in time, not for a frequency response; leave it out")
+        if self.inputs is not None:
+            raise OptionError("inputs", "inputs are for records in time; a frequency response has one input")
         low, high = self.delay_bounds
         known = places_of(self.fixed, Structure(self.poles, self.zeros).names)
         coefficients = KnownCoefficients.of(self.poles, self.zeros, known) if known else NOTHING

@@ -89,52 +89,49 @@ def rounding_of(gram: Array, theta: Array) -> float:
     return float(ROUNDING * (sizes[-1] + np.sum(np.abs(theta) * sizes[:-1])) ** 2)
 
 
-@njit(cache=True, nogil=True)
-def factorise(gram: Array, ridge: float) -> tuple[bool, Array, Array]:
-    """Return success, the Cholesky factor of the second moments scaled to a unit diagonal, and the scales."""
-    n = len(gram) - 1
-    # A unit diagonal makes the pivots below comparable with rounding, for any units of the columns.
-    factor, scales = np.zeros((n, n)), np.sqrt(np.diag(gram)[:n])
-    if not (np.isfinite(scales) & (scales > 0.0)).all():
-        return False, factor, scales
+@njit(cache=True, nogil=True, error_model="numpy")
+def solve(gram: Array, ridge: float, columns: Array) -> bool:
+    """Solve ``G X = B`` in place for the second moments G of the regressors; return False if they are singular."""
+    n, count = columns.shape
+    matrix, scales = np.empty((n, n)), np.empty(n)
     for i in range(n):
+        scales[i] = np.sqrt(gram[i, i])
+        if not 0.0 < scales[i] < np.inf:
+            return False
+        # A unit diagonal makes the pivots comparable with rounding, for any units of the regressors.
         for j in range(i + 1):
-            total = gram[i, j] / (scales[i] * scales[j])
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            if i > j:
-                factor[i, j] = total / factor[j, j]
-            elif total + ridge > 4e-16 * n:
-                factor[i, i] = np.sqrt(total + ridge)
-            else:
-                # The remainder of a linearly dependent column is rounding error: not positive definite.
-                return False, factor, scales
-    return True, factor, scales
-
-
-@njit(cache=True, nogil=True)
-def substitute(factor: Array, scales: Array, values: Array) -> None:
-    """Solve ``S L L' S x = b`` in place, with S the scales."""
-    n = values.size
-    values /= scales
-    for i in range(n):
-        for k in range(i):
-            values[i] -= factor[i, k] * values[k]
-        values[i] /= factor[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            values[i] -= factor[k, i] * values[k]
-        values[i] /= factor[i, i]
-    values /= scales
+            matrix[j, i] = gram[i, j] / (scales[i] * scales[j])
+        matrix[i, i] += ridge
+        for c in range(count):
+            columns[i, c] /= scales[i]
+    for k in range(n):
+        # The remainder of a linearly dependent column is rounding error.
+        if not matrix[k, k] > 1e-15 * n:
+            return False
+        for i in range(k + 1, n):
+            factor = matrix[k, i] / matrix[k, k]
+            for j in range(i, n):
+                matrix[i, j] -= factor * matrix[k, j]
+            for c in range(count):
+                columns[i, c] -= factor * columns[k, c]
+    for k in range(n - 1, -1, -1):
+        for c in range(count):
+            for j in range(k + 1, n):
+                columns[k, c] -= matrix[k, j] * columns[j, c]
+            columns[k, c] /= matrix[k, k]
+    for k in range(n):
+        for c in range(count):
+            columns[k, c] /= scales[k]
+    return True
 
 
 @njit(cache=True, nogil=True)
 def least_squares(gram: Array, ridge: float, theta: Array) -> bool:
     """Compute the least-squares parameters; return False if the second moments do not determine them."""
-    determined, factor, scales = factorise(gram, ridge)
+    solution = gram[:-1, -1:].copy()
+    determined = solve(gram, ridge, solution)
     if determined:
-        theta[:] = gram[theta.size, : theta.size]
-        substitute(factor, scales, theta)
+        theta[:] = solution[:, 0]
     return determined
 
 
@@ -186,12 +183,8 @@ def decode(theta: Array, clock: Clock, roots: Array, omega: Array) -> int:
         omega[:] = np.nan
         return COMPLEX_ROOTS
     if not real_roots(theta, roots):
-        # Real parts of the eigenvalues of the companion matrix.
         flags = COMPLEX_ROOTS
-        companion = np.zeros((n, n), np.complex128)
-        companion[0] = -theta
-        companion[1:, : n - 1] = np.eye(n - 1)
-        roots[:] = np.linalg.eigvals(companion).real
+        roots[:] = np.roots(np.append(1.0, theta).astype(np.complex128)).real
     # The largest cosine belongs to the lowest frequency, and clipping preserves the order.
     if n > 2 or flags:
         roots[:] = np.sort(roots)[::-1]
@@ -238,27 +231,28 @@ def flag_uncertain(
     error is multiplied by ``(period/span)^5``. This also applies to the first two periods; later a misfit is reliable,
     even if the estimate is from fewer samples.
     """
-    determined, factor, scales = factorise(gram, 0.0)
-    if not determined:
-        return UNDETERMINED
-    n, misfit, rounded = theta.size, squared_residual(gram, theta), rounding_of(gram, theta)
-    if misfit < DETERMINED * rounded:
-        misfit = min(left, max(misfit, rounded))
-    spacings = spacings_of(omega)
+    n = theta.size
+    # d c_i/d theta_k = -c_i^(n-k)/prod_j(c_i - c_j), and w = arccos(c)/h.
+    slopes = np.empty((n, n))
     for i in range(n):
-        # d c_i/d theta_k = -c_i^(n-k)/prod_j(c_i - c_j), and w = arccos(c)/h.
         others = roots[i] - roots
         others[i] = clock.delay * np.sqrt(max(1.0 - roots[i] * roots[i], 0.0))
-        slopes = roots[i] ** np.arange(n - 1, -1, -1) / np.prod(others)
-        direction = slopes.copy()
-        substitute(factor, scales, direction)
-        error = np.sqrt(max(np.sum(direction * slopes), 0.0) * misfit)
+        slopes[:, i] = roots[i] ** np.arange(n - 1, -1, -1) / np.prod(others)
+    directions = slopes.copy()
+    if not solve(gram, 0.0, directions):
+        return UNDETERMINED
+    misfit, rounded = squared_residual(gram, theta), rounding_of(gram, theta)
+    if misfit < DETERMINED * rounded:
+        misfit = min(left, max(misfit, rounded))
+    errors = np.sqrt(np.maximum(np.sum(slopes * directions, axis=0), 0.0) * misfit)
+    spacings, sizes = spacings_of(omega), np.sqrt(np.diag(gram)[:n])
+    for i in range(n):
         periods = spacings[i] * min(span, elapsed / FIRST_PERIODS) / (2.0 * np.pi)
         if periods < 1.0:
-            error /= max(periods, 1e-30) ** 5
+            errors[i] /= max(periods, 1e-30) ** 5
         # Rounding does not depend on the time span. Equal roots give NaN.
-        rounding = np.sqrt(ROUNDING * rounded) * np.sum(np.abs(direction) * scales)
-        if not error + rounding <= CERTAIN_FRACTION * spacings[i]:
+        rounding = np.sqrt(ROUNDING * rounded) * np.sum(np.abs(directions[:, i]) * sizes)
+        if not errors[i] + rounding <= CERTAIN_FRACTION * spacings[i]:
             return UNCERTAIN
     return 0
 
@@ -290,12 +284,12 @@ def flag_inconsistent(gram: Array, omega: Array, delay: float, negligible: float
 #: Negligible residual of the frequencies at the second delay, as a fraction of the regressand's second moment.
 MIXED_NEGLIGIBLE = 1e-4
 #: Time span of the residuals that check an estimate, as a multiple of n h.
-JUDGED_SPANS = 4
+CHECKED_SPANS = 4
 NEWEST, USUAL, LEFT = range(3)
-SINCE_VERDICT, VERDICT, SINCE_DOUBT, SINCE_CHANGE = range(4)
+SINCE_CHECK, RESULT, SINCE_UNCERTAIN, SINCE_CHANGE = range(4)
 
 
-class Judged(NamedTuple):
+class Checks(NamedTuple):
     """State of the checks of estimates."""
 
     #: Number of samples after which the effect of a change has ended.
@@ -308,17 +302,17 @@ class Judged(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def judge_rows(
-    theta: Array, rows: Array, grams: Array, counts: Array, clock: Clock, judged: Judged, omega: Array, flags: Flags
+def check_estimates(
+    theta: Array, rows: Array, grams: Array, counts: Array, clock: Clock, checks: Checks, omega: Array, flags: Flags
 ) -> None:
     """Decode estimates and flag unreliable ones by the moments of recent rows at both delays.
 
     ``counts`` contains, for each estimate, its number of recent rows (without any it is not checked), its number of
     samples, and the number of all samples so far; ``flags`` are the known flags, which are extended.
     """
-    n, before, levels, counters = theta.shape[1], judged.theta, judged.levels, judged.counters
+    n, before, levels, counters = theta.shape[1], checks.theta, checks.levels, checks.counters
     roots, interval = np.empty(n), clock.interval
-    smoothing, forgotten = 1.0 / max(1.0, DETECTOR_SPAN * clock.lag), 1.0 / (JUDGED_SPANS * n * clock.lag)
+    smoothing, forgotten = 1.0 / max(1.0, DETECTOR_SPAN * clock.lag), 1.0 / (CHECKED_SPANS * n * clock.lag)
     for k in range(len(theta)):
         omega[k] = np.nan
         if np.isnan(theta[k, 0]):
@@ -336,28 +330,28 @@ def judge_rows(
             levels[LEFT] += square - forgotten * levels[LEFT]
         # A contradicted estimate is checked at once, others at regular intervals.
         contradicted = started and levels[NEWEST] > levels[USUAL]
-        if counters[SINCE_VERDICT] == 0 or contradicted:
+        if counters[SINCE_CHECK] == 0 or contradicted:
             gram, check = grams[k, 0].copy(), grams[k, 1].copy()
-            verdict = flag_uncertain(gram, levels[LEFT], theta[k], roots, omega[k], clock, span, elapsed)
-            if contradicted or verdict:
-                verdict |= UNCERTAIN
+            result = flag_uncertain(gram, levels[LEFT], theta[k], roots, omega[k], clock, span, elapsed)
+            if contradicted or result:
+                result |= UNCERTAIN
                 levels[NEWEST] = 0.0
                 if started:
-                    counters[SINCE_DOUBT] = 0
+                    counters[SINCE_UNCERTAIN] = 0
                 if contradicted:
                     counters[SINCE_CHANGE] = 0
             # The window must not contain rows from before a change.
-            elif counters[SINCE_CHANGE] < judged.flush or not lasts_a_period(
-                omega[k], counters[SINCE_DOUBT] * interval
+            elif counters[SINCE_CHANGE] < checks.flush or not lasts_a_period(
+                omega[k], counters[SINCE_UNCERTAIN] * interval
             ):
-                verdict = UNCERTAIN
-            verdict |= flag_inconsistent(check, omega[k], clock.second_delay, MIXED_NEGLIGIBLE)
-            counters[VERDICT] = verdict
+                result = UNCERTAIN
+            result |= flag_inconsistent(check, omega[k], clock.second_delay, MIXED_NEGLIGIBLE)
+            counters[RESULT] = result
             misfit = max(squared_residual(gram, theta[k]), rounding_of(gram, theta[k]))
             levels[USUAL] = ALARM_RATIO * misfit / weight
-        counters[SINCE_VERDICT] = (counters[SINCE_VERDICT] + 1) % clock.every if started else 0
-        counters[SINCE_DOUBT:] += 1
-        flags[k] |= counters[VERDICT]
+        counters[SINCE_CHECK] = (counters[SINCE_CHECK] + 1) % clock.every if started else 0
+        counters[SINCE_UNCERTAIN:] += 1
+        flags[k] |= counters[RESULT]
 
 
 # --- least squares that restart when the signal changes ------------------------------------------------------------
@@ -376,7 +370,7 @@ EXACT = 1e-13
 NEGLIGIBLE = 1e-8
 OLDER, NEWER, CHECK = range(3)
 RESIDUAL, ALARM = 2, 3
-ROWS, NEXT, FLUSH, LAST_VERDICT = range(4)
+ROWS, NEXT, FLUSH, LAST_CHECK = range(4)
 
 
 class Restarting(NamedTuple):
@@ -407,7 +401,7 @@ class Fit(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def judge(gram: Array, theta: Array, omega: Array, clock: Clock, rows: float, age: float) -> tuple[int, bool]:
+def check_fit(gram: Array, theta: Array, omega: Array, clock: Clock, rows: float, age: float) -> tuple[int, bool]:
     """Compute the frequencies of a fit to the rows since a restart; return flags, and whether it can test new samples.
 
     It can if it is certain, or if it is too old for a starting misfit.
@@ -428,8 +422,8 @@ def drop_mixed_rows(clock: Clock, compared: int, fit: Fit) -> bool:
     if levels[OLDER] > 0.0 and least_squares(newer, 0.0, theta):
         # A fit to too few rows must not reject the others, unless it is exact.
         alone = squared_residual(newer, theta)
-        judges = judge(newer, theta, omega, clock, levels[NEWER], levels[NEWER])[1]
-        if (judges or alone <= EXACT * newer[-1, -1]) and least_squares(gram, 0.0, theta):
+        reliable = check_fit(newer, theta, omega, clock, levels[NEWER], levels[NEWER])[1]
+        if (reliable or alone <= EXACT * newer[-1, -1]) and least_squares(gram, 0.0, theta):
             together = squared_residual(gram, theta) - 1e-14 * gram[-1, -1]
             mixed = together / (levels[OLDER] + levels[NEWER]) > MIXED_RATIO * alone / levels[NEWER]
     if mixed:
@@ -452,7 +446,7 @@ def refresh(clock: Clock, whitener: Array, fit: Fit) -> None:
     n, theta, levels, counters = fit.theta.size, fit.theta, fit.levels, fit.counters
     gram, weight = fit.moments[OLDER] + fit.moments[NEWER], levels[OLDER] + levels[NEWER]
     # Tones that the rows do not resolve give a singular matrix; the last estimate is then kept with a flag.
-    counters[LAST_VERDICT] = UNDETERMINED
+    counters[LAST_CHECK] = UNDETERMINED
     if not least_squares(gram, 0.0, theta):
         return
     if whitener.size > 0:
@@ -462,11 +456,11 @@ def refresh(clock: Clock, whitener: Array, fit: Fit) -> None:
         theta[:] = -v[:n] / v[n:]
     # The lower limit prevents alarms by residuals of an exact fit, which are rounding.
     levels[ALARM] = (ALARM_RATIO * squared_residual(gram, theta) + ROUNDING_FLOOR * gram[n, n]) / weight
-    verdict, judges = judge(gram, theta, fit.omega, clock, weight, counters[ROWS])
-    if not judges:
+    result, reliable = check_fit(gram, theta, fit.omega, clock, weight, counters[ROWS])
+    if not reliable:
         levels[ALARM] = np.inf
     inconsistent = flag_inconsistent(fit.moments[CHECK], fit.omega, clock.second_delay, NEGLIGIBLE)
-    counters[LAST_VERDICT] = verdict | inconsistent
+    counters[LAST_CHECK] = result | inconsistent
 
 
 @njit(cache=True, nogil=True)
@@ -485,7 +479,7 @@ def restarting_fits(rows: Array, clock: Clock, settings: Restarting, fit: Fit, o
             if counters[ROWS] == 0:
                 # The first comparison needs an older half.
                 counters[NEXT] = settings.compared // 2
-                counters[LAST_VERDICT] = 0
+                counters[LAST_CHECK] = 0
                 moments[:] = 0.0
                 levels[: RESIDUAL + 1] = 0.0
             elif counters[ROWS] >= settings.armed:
@@ -512,4 +506,4 @@ def restarting_fits(rows: Array, clock: Clock, settings: Restarting, fit: Fit, o
         if counters[ROWS] < settings.enough and flag == 0:
             flag = STARTING
         omega[k] = own_omega
-        flags[k] = flag | counters[LAST_VERDICT]
+        flags[k] = flag | counters[LAST_CHECK]

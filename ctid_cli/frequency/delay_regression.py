@@ -30,7 +30,7 @@ GOLDEN_FRACTION = (np.sqrt(5.0) - 1.0) / 2.0
 #: Largest distance to a number without a common divisor, for all allowed delays.
 SEARCHED = 100
 #: Checks per delay h, and the greatest number of samples between two of them.
-VERDICTS_PER_DELAY = 64
+CHECKS_PER_DELAY = 64
 MOST_BETWEEN = 8
 #: Relative change of a delay by rounding to whole sampling intervals above which there is a warning.
 NOTEWORTHY_ROUNDING = 0.01
@@ -105,7 +105,7 @@ class DelayRegression(Checked, FrequencyEstimator):
         """Yield warnings about aliases of frequencies at the delay, and about a rounded delay."""
         if highest * self.h > np.pi:
             limit = f"with h = {self.h:g} s, frequencies above pi/h = {np.pi / self.h:.4g} rad/s"
-            yield "h", f"{limit} are seen as lower ones, and the signal has {highest:g} rad/s"
+            yield "h", f"{limit} are aliases of lower ones, and the signal has {highest:g} rad/s"
         delay = whole_delay("h", self.h, interval) * interval
         if abs(delay - self.h) > NOTEWORTHY_ROUNDING * self.h:
             whole = f"no whole number of sampling intervals of {interval:g} s"
@@ -114,7 +114,7 @@ class DelayRegression(Checked, FrequencyEstimator):
     def clock(self, interval: float) -> Clock:
         """Return the regression at a sampling interval [s]."""
         lag = whole_delay("h", self.h, interval)
-        second, every = second_lag(lag), max(1, min(lag // VERDICTS_PER_DELAY, MOST_BETWEEN))
+        second, every = second_lag(lag), max(1, min(lag // CHECKS_PER_DELAY, MOST_BETWEEN))
         return Clock(float(interval), lag, lag * interval, second, second * interval, every)
 
     def weights(self, interval: float) -> Array:
@@ -154,7 +154,7 @@ class Online(ABC):
         self.options, self.clock = options, options.clock(interval)
         self.weights = options.weights(interval)
         self.table = delay_table(options.tones)
-        self._seen = 0
+        self._count = 0
         self._unfiltered = Tail(np.full(self.weights.size - 1, past))
         self._filtered = Tail(np.full(2 * options.tones * self.clock.lag, past))
 
@@ -166,8 +166,8 @@ class Online(ABC):
         """Process the next sample, NaN if missing, and return the row of the track at its instant."""
         omega, flags = np.empty((1, self.options.tones)), np.zeros(1, np.uint16)
         self.advance(series_of([float(sample)]), omega, flags)
-        self._seen += 1
-        return FrequencyTrack(np.array([(self._seen - 1) * self.clock.interval]), omega, flags)
+        self._count += 1
+        return FrequencyTrack(np.array([(self._count - 1) * self.clock.interval]), omega, flags)
 
     def rows(self, samples: Array) -> Array:
         """Return the rows ``[phi psi]`` at h and at the second delay, (2, N, n + 1); NaN for missing samples."""

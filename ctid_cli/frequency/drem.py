@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, IntArray
-from ctid_cli.frequency.delay_kernels import JUDGED_SPANS, Judged, judge_rows
+from ctid_cli.frequency.delay_kernels import CHECKED_SPANS, Checks, check_estimates
 from ctid_cli.frequency.delay_regression import DelayRegression, Online, Tail, theta_of, whole_delay
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.checks import require_integer, require_positive
@@ -203,7 +203,7 @@ class OnlineMixing(Online):
         self._used = 0.0
         window_of_sums = np.zeros((window + 1, n + 3 + 2 * (n + 1) ** 2))
         self._sliding = window_of_sums[1:], window_of_sums[0], np.zeros(1, np.int64)
-        self._judged = Judged(filled + window, np.full(n, np.nan), np.zeros(3), np.array([0, 0, 1 << 50, 1 << 50]))
+        self._checks = Checks(filled + window, np.full(n, np.nan), np.zeros(3), np.array([0, 0, 1 << 50, 1 << 50]))
 
     def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
         """Return theta by least squares over the window, NaN if Delta is zero, and the mixed rows in the window."""
@@ -234,7 +234,7 @@ class OnlineMixing(Online):
         flags[~excited & (used > 0)] |= int(Flag.UNDETERMINED)
         counts = np.column_stack((excited * sums[:, n + 2], self._reach + support, self._reach + used))
         grams = sums[:, n + 3 :].reshape(count, 2, n + 1, n + 1)
-        judge_rows(theta, rows[0], grams, counts, self.clock, self._judged, omega, flags)
+        check_estimates(theta, rows[0], grams, counts, self.clock, self._checks, omega, flags)
 
 
 class OnlineGradient(OnlineMixing):
@@ -242,7 +242,7 @@ class OnlineGradient(OnlineMixing):
 
     def __init__(self, options: DremGradient, interval: float) -> None:
         n, lag = options.tones, whole_delay("h", options.h, interval)
-        super().__init__(options, interval, JUDGED_SPANS * n * lag, np.nan if options.gated else 0.0)
+        super().__init__(options, interval, CHECKED_SPANS * n * lag, np.nan if options.gated else 0.0)
         self.scale = float(options.epsilon) ** (n if options.power == "literal" else int(options.power))
         spread = np.pi / self.clock.delay * np.arange(1, n + 1) / (n + 1)
         initial = spread if options.initial_frequencies is None else options.initial_frequencies

@@ -40,7 +40,7 @@ MEANINGS: dict[Flag, str] = {
     Flag.STARTING: "Too few samples have arrived since the start or since the last restart.",
     Flag.GAP: "A sample that the estimate needs at this instant is missing or not finite.",
     Flag.CHANGED: "The signal changed: the estimate is held until all samples from before have left the delays.",
-    Flag.UNDETERMINED: "The signal has fewer tones, or two that look alike at this delay; use fewer tones.",
+    Flag.UNDETERMINED: "The signal has fewer tones, or two that are equal at this delay; use fewer tones or another h.",
     Flag.UNCERTAIN: (
         "Noise, a bias or another tone may move a frequency by a tenth of itself or of the distance to the next one; "
         "use a prefilter, more tones or a longer record."
@@ -48,14 +48,14 @@ MEANINGS: dict[Flag, str] = {
     Flag.COMPLEX_ROOTS: "The estimated parameters belong to no set of real frequencies.",
     Flag.OUT_OF_BOUNDS: "A frequency beyond the bounds, zero and pi/h if none are given, was put on the bound.",
     Flag.INCONSISTENT: (
-        "The frequencies do not explain the signal at a second delay: a tone above pi/h is seen as another one (use a "
-        "smaller h), or the estimate lags behind a change."
+        "The frequencies do not explain the signal at a second delay: a tone above pi/h is an alias of another one "
+        "(use a smaller h), or the estimate lags behind a change."
     ),
     Flag.NOT_CONVERGED: "The iterations did not converge; start closer, or use a longer record.",
     Flag.CHANGE: "Frequency, amplitude or phase change here faster than any window can follow.",
-    Flag.UNRESOLVED: "Another tone is so near that no window tells the two apart; use a longer record.",
-    Flag.INACCURATE: "The standard error is larger than the accuracy that was asked for; allow more with --accuracy.",
-    Flag.ABSENT: "The tone is not there, or not beyond doubt, at this instant.",
+    Flag.UNRESOLVED: "Another tone is so near that no window resolves the two; use a longer record.",
+    Flag.INACCURATE: "The standard error is larger than the requested accuracy; allow more with --accuracy.",
+    Flag.ABSENT: "The tone is absent, or not significant, at this instant.",
 }
 
 

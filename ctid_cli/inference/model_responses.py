@@ -23,7 +23,6 @@ from ctid_cli.errors import DataError, UsageError
 from ctid_cli.inference.derived import indistinct
 from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import Uncertainty
-from ctid_cli.signals.checks import require_increasing
 from ctid_cli.signals.held import HeldSignal
 
 
@@ -288,9 +287,8 @@ def _check(level: float, bands: str) -> None:
 def instants(times: ArrayLike) -> Array:
     """Return the given instants, checked."""
     t = np.atleast_1d(np.array(times, dtype=float))
-    if t.ndim != 1 or not np.isfinite(t).all():
-        raise DataError("the instants of a response must be a list of finite numbers")
-    require_increasing("instants", t)
+    if t.ndim != 1 or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
+        raise DataError("the instants of a response must be a list of finite numbers that increase strictly")
     return t
 
 

@@ -192,7 +192,7 @@ def _response_p_value(record: Record) -> float:
     """Return the p-value of the test for a response, with the system initially in equilibrium."""
     signal = record.input
     moved = HeldSignal(signal.t, signal.values - signal.at(record.t[:1]), signal.hold)
-    test = response_test([record.driven_by(u=moved)], [record.valid], (0.0, LONGEST_DELAY * record.duration))
+    test = response_test([replace(record, inputs=moved)], [record.valid], (0.0, LONGEST_DELAY * record.duration))
     return test.p_value
 
 

@@ -183,10 +183,10 @@ def _groups(fractions: _PartialFractions, terms: Sequence[Term] | None) -> list[
 def _check_terms(fractions: _PartialFractions, terms: Sequence[Term], direct: int) -> None:
     """Raise an error if the terms do not match the partial fractions; ``direct`` is the number of biproper terms."""
     pairs, n, integrators = fractions.pairs, fractions.poles.size, fractions.at_origin.size
-    asked = sum(term.poles for term in terms), sorted(term.integrators for term in terms if term.integrators)
-    if asked != (n, [integrators] * (integrators > 0)):
+    given = sum(term.poles for term in terms), sorted(term.integrators for term in terms if term.integrators)
+    if given != (n, [integrators] * (integrators > 0)):
         raise DataError(
-            f"the terms have {asked[0]} poles and {sum(asked[1])} integrators, the latter in {len(asked[1])} of them; "
+            f"the terms have {given[0]} poles and {sum(given[1])} integrators, the latter in {len(given[1])} of them; "
             f"the model has {n} poles and {integrators} at the origin, which must be in one term"
         )
     possible = sum(term.poles // 2 for term in terms)

@@ -38,7 +38,7 @@ from ctid_cli.reporting.records import Records
 from ctid_cli.signals.band_limited import band_limited_doubt
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.measurement import Measurement
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Loop, Record
 from ctid_cli.signals.treatment import Hold
 from ctid_cli.storage.fit_file import fit_text
 from ctid_cli.text import count, listed, probability
@@ -338,7 +338,16 @@ def _loop(options: Options, measurement: Measurement) -> Iterator[tuple[str, str
     elif instruments == "closed_loop" and loop is not None and loop.controller is not None:
         simulated = isinstance(options, LoopOutputError)
         how = "output error of the simulated loop, y - T r" if simulated else "instruments from the noise-free loop"
-        yield "loop", f"{loop.formula}; r = {measurement.reference}; {how}"
+        yield "loop", f"{_control_law(loop)}; r = {measurement.reference}; {how}"
+
+
+def _control_law(loop: Loop) -> str:
+    """Return the input from reference r and output y."""
+    sides = (getattr(loop.controller, name) for name in ("numerator", "denominator"))
+    b, a = (" ".join(f"{c:.6g}" for c in np.asarray(side)) for side in sides)
+    p = "s" if loop.continuous else "q"
+    where = f"u = C({p}) (r - y)" if loop.enters == "controller" else f"u = r - C({p}) y"
+    return f"{where}, C = ({b})/({a}) in descending powers of {p}"
 
 
 def _record_line(measurement: Measurement, used: int, units: Units) -> str:

@@ -11,6 +11,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,9 +20,10 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
+from ctid_cli.signals.data_checks import Rows
 from ctid_cli.signals.files import require_file, require_values
 from ctid_cli.signals.hdf5 import hdf5_arrays, text_of
-from ctid_cli.signals.table import Columns, Table
+from ctid_cli.signals.table import Found, Table
 
 MATLAB, HDF5 = (".mat",), (".h5", ".hdf5")
 #: Minimum time limit of reading [s], and speed of the slowest disk [bytes/s].
@@ -31,67 +33,75 @@ LEAST_PATIENCE, SLOWEST = 50.0, 5e6
 def read_array_table(path: str | os.PathLike[str]) -> Table:
     """Read the variables of a MATLAB file, or the data sets of an HDF5 file; an attribute ``unit`` gives the unit."""
     file = require_file(path, f" the file is empty; {_how_to_save(path)}")
-    told, vectors = _read_in_own_process(path, file)
-    if "refused" in told:
-        raise DataError(f"{file}: {told['refused']}")
-    names, wrong = told["names"], told["wrong"]
-    hint = " ".join(_how_to_export(path, name, kind) for name, kind in told["objects"].items())
-    if not names:
-        raise DataError(f"{file}: {hint}" if hint else f"{file}: the file holds no arrays; {_how_to_save(path)}")
-    noun = "variable" if Path(path).suffix.lower() in MATLAB else "data set"
+    status = os.stat(path)
+    return _read_table(file, (status.st_ino, status.st_size, status.st_mtime_ns))
 
-    def read(asked: Sequence[str]) -> Columns:
-        for name in asked:
+
+@lru_cache(maxsize=2)  # a command first looks at the names of a file
+def _read_table(file: str, version: tuple[int, ...]) -> Table:
+    """Read one version of a file."""
+    content, vectors = _read_in_own_process(file)
+    if "refused" in content:
+        raise DataError(f"{file}: {content['refused']}")
+    names, wrong = content["names"], content["wrong"]
+    noun = "variable" if Path(file).suffix.lower() in MATLAB else "data set"
+    hints = [_how_to_export(file, name, kind) for name, kind in content["objects"].items()]
+    hints = hints or [f"{noun.capitalize()} {name!r} {why}" for name, why in list(wrong.items())[:1]]
+    if not names:
+        raise DataError(f"{file}: {' '.join(hints) or f'the file holds no arrays; {_how_to_save(file)}'}")
+
+    def read(wanted: Sequence[str]) -> Found:
+        for name in wanted:
             if name in wrong:
                 raise DataError(f"{file}: {noun} {name!r} {wrong[name]}")
-        return Columns(file, {name: vectors[name] for name in asked})
+        return Found({name: vectors[name] for name in wanted}, Rows(file))
 
-    return Table(file, tuple(names), read, head=file, noun=noun, hint=hint)
+    return Table(file, tuple(names), read, head=file, noun=noun, hint=" ".join(hints))
 
 
-def _read_in_own_process(path: str | os.PathLike[str], file: str) -> tuple[dict[str, Any], dict[str, Array]]:
+def _read_in_own_process(file: str) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return the result of ``_write_content``; refuse a file that crashes it, or takes too long."""
     with TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True) as made:
         folder = Path(made)
         with warnings.catch_warnings():
             # The process runs only this function, so threads of other processes do not matter.
             warnings.simplefilter("ignore", DeprecationWarning)
-            process = multiprocessing.get_context("fork").Process(target=_write_content, args=(path, folder))
+            process = multiprocessing.get_context("fork").Process(target=_write_content, args=(file, folder))
             process.start()
-        process.join(LEAST_PATIENCE + Path(path).stat().st_size / SLOWEST)
+        process.join(LEAST_PATIENCE + os.stat(file).st_size / SLOWEST)
         if process.is_alive():
             process.kill()
             process.join()
         if process.exitcode != 0:
-            kind = "a MATLAB file" if Path(path).suffix.lower() in MATLAB else "an HDF5 file"
-            raise DataError(f"{file}: this is not {kind}, or a damaged one; {_how_to_save(path)}")
-        told: dict[str, Any] = json.loads((folder / "told.json").read_text(encoding="utf-8"))
-        right = {name: k for k, name in enumerate(told.get("names", ())) if name not in told["wrong"]}
-        return told, {name: np.load(folder / f"{k}.npy", allow_pickle=False) for name, k in right.items()}
+            kind = "a MATLAB file" if Path(file).suffix.lower() in MATLAB else "an HDF5 file"
+            raise DataError(f"{file}: this is not {kind}, or a damaged one; {_how_to_save(file)}")
+        content: dict[str, Any] = json.loads((folder / "content.json").read_text(encoding="utf-8"))
+        saved = {name: folder / f"{k}.npy" for k, name in enumerate(content.get("names", ()))}
+        return content, {name: np.load(path, allow_pickle=False) for name, path in saved.items() if path.exists()}
 
 
-def _write_content(path: str | os.PathLike[str], folder: Path) -> None:
+def _write_content(file: str, folder: Path) -> None:
     """Write the vectors of a file to a folder, and the reasons why other variables are not vectors."""
     faulthandler.disable()  # a crash is expected here
-    told: dict[str, Any]
     try:
-        arrays, objects = _arrays(path)
-        told = {"names": list(arrays), "objects": objects, "wrong": {}}
+        arrays, objects = _arrays(file)
+        wrong = {}
         for k, (name, value) in enumerate(arrays.items()):
             try:
                 np.save(folder / f"{k}.npy", _vector(value), allow_pickle=False)
             except ValueError as error:
-                told["wrong"][name] = str(error)
+                wrong[name] = str(error)
+        content: dict[str, Any] = {"names": list(arrays), "objects": objects, "wrong": wrong}
     except DataError as error:
-        told = {"refused": str(error)}
+        content = {"refused": str(error)}
     except PermissionError as error:
-        told = {"refused": f"cannot be read: {error.strerror}"}
+        content = {"refused": f"cannot be read: {error.strerror}"}
     except Exception:  # C readers fail on damage in many ways, including memory errors; the caller reports it
         raise SystemExit(1) from None
-    (folder / "told.json").write_text(json.dumps(told), encoding="utf-8")
+    (folder / "content.json").write_text(json.dumps(content), encoding="utf-8")
 
 
-def _arrays(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, str]]:
+def _arrays(path: str) -> tuple[dict[str, Any], dict[str, str]]:
     """Return arrays by name, and the classes of objects by name."""
     import scipy.io
 
@@ -138,24 +148,17 @@ def _flat(content: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
 def _vector(value: Any) -> Array:
     """Return an array as a vector of real numbers; a ValueError gives the reason if it is not one."""
     if hasattr(value, "toarray"):
-        try:
-            # Indices are checked before they are used for writing.
-            value.tocsc().check_format(full_check=True)
-            value = value.toarray()
-        except (ValueError, MemoryError):
-            raise ValueError("is a damaged sparse matrix") from None
+        raise ValueError("is a sparse matrix; save it as a full one")
     array = np.asarray(value)
-    if array.dtype.kind not in "biufc":
+    if array.dtype.kind == "c":
+        raise ValueError("holds complex numbers; save its real or imaginary part")
+    if array.dtype.kind not in "biuf":
         raise ValueError("does not hold numbers")
     if array.size == 0:
         raise ValueError("is empty")
     if array.size != max(array.shape, default=1):
         shape = "x".join(str(n) for n in array.shape)
         raise ValueError(f"is a {shape} array; save the columns you mean as vectors of their own")
-    if array.dtype.kind == "c":
-        if np.any(array.imag != 0):
-            raise ValueError("holds complex numbers; save its real or imaginary part")
-        array = array.real
     return np.array(array, dtype=float).reshape(-1)
 
 

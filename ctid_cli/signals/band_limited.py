@@ -37,12 +37,19 @@ class BandLimitedDoubt(NamedTuple):
     beyond: float
 
 
-def finer_values(values: Array, *, periodic: bool) -> Array:
-    """Return points whose connecting straight lines have the spectrum of a signal.
+def finer_values(values: Array) -> Array:
+    """Return points from the first to the last sample whose connecting lines have the spectrum of a signal."""
+    return _of_window(values, "odd")
 
-    For a periodic signal they cover one whole period, ``4 N`` points; otherwise the first to the last sample.
-    """
-    return _of_series(values) if periodic else _of_window(values, "odd")
+
+def periodic_values(values: Array) -> Array:
+    """Return the ``4 N`` points of one period whose connecting lines have the spectrum of a periodic signal."""
+    n = values.size
+    spectrum = np.fft.rfft(values) / np.sinc(np.arange(n // 2 + 1) / (n * FINER)) ** 2
+    if n % 2 == 0:
+        # The line at half the sampling frequency is divided between two lines on the finer clock.
+        spectrum[-1] *= 0.5
+    return np.asarray(np.fft.irfft(spectrum, n * FINER) * FINER)
 
 
 def values_between(values: Array) -> Array:
@@ -71,15 +78,6 @@ def band_limited_doubt(t: Array, values: Array) -> BandLimitedDoubt:
     beyond = float(power[int(PASSED * (power.size - 1)) :].sum()) / total if total > 0 else 0.0
     interval = float(t[-1] - t[0]) / (n - 1)
     return BandLimitedDoubt(min(REACH, n // 2) * interval, float(np.sqrt(np.mean(off**2))), beyond)
-
-
-def _of_series(values: Array) -> Array:
-    n = values.size
-    spectrum = np.fft.rfft(values) / np.sinc(np.arange(n // 2 + 1) / (n * FINER)) ** 2
-    if n % 2 == 0:
-        # The line at half the sampling frequency is divided between two lines on the finer clock.
-        spectrum[-1] *= 0.5
-    return np.asarray(np.fft.irfft(spectrum, n * FINER) * FINER)
 
 
 def _of_window(values: Array, beyond: str, *, undamped: bool = True) -> Array:

@@ -12,29 +12,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import numpy as np
 
-from ctid_cli.arrays import Array
-from ctid_cli.errors import DataError, OptionError
-
-#: Largest magnitude of a signal; its reciprocal is the smallest. Fourth powers of it do not overflow.
-LARGEST = 1e60
-#: Largest magnitude of times and of steps between them [s]; high powers of poles do not overflow.
-LONGEST = 1e24
-
-
-def require_scale(what: str, values: Array, largest: float = LARGEST) -> None:
-    """Refuse a signal whose unit makes it too small or too large for computation; zeros are allowed."""
-    finite = np.abs(values[np.isfinite(values)])
-    found = float(finite.max(initial=0.0))
-    if found > largest or 0.0 < found < 1.0 / largest:
-        side = f"reaches {found:.3g}" if found > largest else f"is at most {found:.3g}"
-        raise DataError(f"{what} {side}; give it in a unit in which it is between {1 / largest:g} and {largest:g}")
-
-
-def require_steps(what: str, t: Array) -> None:
-    """Refuse a clock that is too fast for computation."""
-    least = float(np.diff(t).min(initial=np.inf))
-    if least < 1.0 / LONGEST:
-        raise DataError(f"{what} advances by {least:.3g}; give it in a unit in which it is at least {1 / LONGEST:g}")
+from ctid_cli.errors import OptionError
 
 
 def require_positive(name: str, value: float, unit: str, label: str = "") -> None:
@@ -74,14 +52,6 @@ def require_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
     """Refuse anything but one of some words."""
     if value not in allowed:
         raise OptionError(name, f"{name} must be {' or '.join(map(repr, allowed))}, not {value!r}.")
-
-
-def require_increasing(name: str, t: Array) -> None:
-    """Refuse instants that do not increase strictly."""
-    late = np.diff(t) <= 0
-    if late.any():
-        k = int(np.argmax(late))
-        raise DataError(f"{name} must increase strictly; samples {k} and {k + 1} are at {t[k]:g} and {t[k + 1]:g} s")
 
 
 def freeze(owner: object, **values: object) -> None:

@@ -16,14 +16,6 @@ MAX_LETTERS, MAX_NAMES = 24, 20
 #: Paths of transferred copies of files, by the SHA-256 of their content.
 COPIES: dict[str, str] = {}
 
-_KINDS = {
-    stat.S_ISDIR: "a folder",
-    stat.S_ISFIFO: "a pipe",
-    stat.S_ISSOCK: "a socket",
-    stat.S_ISCHR: "a device",
-    stat.S_ISBLK: "a device",
-}
-
 
 def require_file(path: str | os.PathLike[str], empty: str = " the file is empty") -> str:
     """Refuse anything but an ordinary file before it is opened: reading a pipe or a device may never end.
@@ -34,11 +26,10 @@ def require_file(path: str | os.PathLike[str], empty: str = " the file is empty"
     try:
         found = os.stat(path)
     except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
-        reason = getattr(error, "strerror", None) if isinstance(error, PermissionError) else None
-        missing = reason or "does not exist"
-        raise DataError(f"{file}: {missing}; relative names start at {Path.cwd()}") from None
+        reason = error.strerror if isinstance(error, PermissionError) else "does not exist"
+        raise DataError(f"{file}: {reason}; relative names start at {Path.cwd()}") from None
     if not stat.S_ISREG(found.st_mode):
-        kind = next((kind for is_one, kind in _KINDS.items() if is_one(found.st_mode)), "something else")
+        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe, a socket or a device"
         raise DataError(f"{file}: is not a file but {kind}; relative names start at {Path.cwd()}")
     if found.st_size == 0:
         raise DataError(f"{file}:{empty}")

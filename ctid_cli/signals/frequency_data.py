@@ -17,7 +17,6 @@ from ctid_cli.signals.held import hold_factor
 from ctid_cli.signals.measurement import open_table
 from ctid_cli.signals.table import Table, split_header
 from ctid_cli.signals.treatment import Weight
-from ctid_cli.text import listed
 
 #: Column names by role; case is ignored.
 NAMES: dict[str, tuple[str, ...]] = {
@@ -95,44 +94,34 @@ class FrequencyData:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        name = f"{self.name}: " if self.name else ""
         w, values = np.array(self.frequencies, dtype=float), np.array(self.response, dtype=complex)
         errors = None if self.standard_error is None else np.array(self.standard_error, dtype=float)
         if w.ndim != 1 or not w.size or values.shape != w.shape or (errors is not None and errors.shape != w.shape):
-            raise DataError(f"{self._what}frequencies, values and standard errors must be lists of one length")
+            raise DataError(f"{name}frequencies, values and standard errors must be lists of one length")
         rate = f"rad/{self.units[0]}"
         if not np.isfinite(w).all() or (w < 0.0).any() or not (w > 0.0).any():
-            raise DataError(f"{self._what}frequencies must be finite numbers [{rate}], none below and some above zero")
+            raise DataError(f"{name}frequencies must be finite numbers [{rate}], none below and some above zero")
         if not np.isfinite(values).all() or not values.any():
-            raise DataError(f"{self._what}values must be finite complex numbers, not all zero")
-        if errors is not None and not (np.isfinite(errors) & (errors > 0.0)).all():
-            k = int(np.argmin(np.isfinite(errors) & (errors > 0.0)))
-            raise DataError(
-                f"{self._what}standard_error at {w[k]:g} {rate} is {errors[k]:g}; it must be a positive number, "
-                "or leave the standard errors out: lines then weigh by --weight"
-            )
+            raise DataError(f"{name}values must be finite complex numbers, not all zero")
+        if errors is not None and not (usable := np.isfinite(errors) & (errors > 0.0)).all():
+            k = int(np.argmin(usable))
+            wrong = f"standard_error at {w[k]:g} {rate} is {errors[k]:g}; it must be a positive number"
+            raise DataError(f"{name}{wrong}, or leave the standard errors out: lines then weigh by --weight")
         if not (np.isfinite(self.interval) and self.interval >= 0.0):
-            raise DataError(
-                f"{self._what}the interval must be a positive number, or 0 for G(jw); got {self.interval!r}"
-            )
-        if self.interval and w.max() > np.pi / self.interval * (1.0 + ROUNDING):
-            raise DataError(
-                f"{self._what}{w.max():g} {rate} is beyond half the sampling frequency, {np.pi / self.interval:g} "
-                f"{rate}, of values of samples; leave such lines out, or correct the interval"
-            )
+            raise DataError(f"{name}the interval must be a positive number, or 0 for G(jw); got {self.interval!r}")
+        if self.interval and w.max() > (limit := np.pi / self.interval) * (1.0 + ROUNDING):
+            beyond = f"{w.max():g} {rate} is beyond half the sampling frequency, {limit:g} {rate}, of values of samples"
+            raise DataError(f"{name}{beyond}; leave such lines out, or correct the interval")
         require_choice("weight", self.weight, get_args(Weight))
         order = np.argsort(w, kind="stable")
-        freeze(
-            self, frequencies=w[order], response=values[order], standard_error=None if errors is None else errors[order]
-        )
+        errors = None if errors is None else errors[order]
+        freeze(self, frequencies=w[order], response=values[order], standard_error=errors)
 
     def __repr__(self) -> str:
         low, high = self.frequencies[[0, -1]]
         kind = f", sampled at intervals of {self.interval:g} {self.units[0]}" if self.interval else ""
         return f"FrequencyData({self.frequencies.size} lines from {low:g} to {high:g} rad/{self.units[0]}{kind})"
-
-    @property
-    def _what(self) -> str:
-        return f"{self.name}: " if self.name else ""
 
 
 def held_data(
@@ -177,33 +166,30 @@ def read_frequency_data(
         If the file is not such a table.
     """
     table = open_table(path)
-    chosen = _named(table)
-    pair = ("real", "imaginary") if {"real", "imaginary"} <= chosen.keys() else ("gain", "phase")
+    names = _named(table)
+    pair = ("real", "imaginary") if {"real", "imaginary"} <= names.keys() else ("gain", "phase")
     for role in ("frequency", *pair):
-        if role not in chosen:
-            raise DataError(
-                f"{table.head}: there is no column {role!r}; a frequency response needs frequency [Hz or rad/s] and "
-                "real and imaginary, or gain [- or dB] and phase [deg or rad]"
-            )
-    roles = [role for role in NAMES if role in chosen and role not in {"real", "imaginary", "gain", "phase"} - {*pair}]
-    columns = table.read([chosen[role] for role in roles])
-    values = {role: columns.values[chosen[role]] for role in roles}
-    scale, time_unit = _rate(table, chosen["frequency"])
-    w, response = values["frequency"] * scale, _complex(table, chosen, values, pair)
+        if role not in names:
+            needed = "frequency [Hz or rad/s] and real and imaginary, or gain [- or dB] and phase [deg or rad]"
+            raise DataError(f"{table.head}: there is no column {role!r}; a frequency response needs {needed}")
+    found = table.read(list(names.values()))
+    values = {role: found.values[name] for role, name in names.items()}
+    scale, time_unit = _rate(table, names["frequency"])
+    w, response = values["frequency"] * scale, _complex(table, names, values, pair)
     used = np.isfinite(w) & np.isfinite(response)
-    notes = [*table.notes, *columns.notes]
+    notes = [*table.notes, *found.notes]
     if lost := int(np.count_nonzero(~used)):
         notes.append(f"{lost} of {w.size} lines have no value and are left out.")
-    for bound, outside in ((low, np.less), (high, np.greater)):
-        used &= True if bound is None else ~outside(values["frequency"], bound)
+    used &= ~(values["frequency"] < (-np.inf if low is None else low))
+    used &= ~(values["frequency"] > (np.inf if high is None else high))
     if not used.any():
         raise DataError(f"{table.file}: no line with a value lies between the frequencies that are given")
-    output, slash, input_ = (split_header(chosen[pair[0]])[1] or "").rpartition("/")
+    output, slash, input_ = (split_header(names[pair[0]])[1] or "").rpartition("/")
     units = (time_unit, output, input_) if slash and output and input_ else (time_unit, "out", "in")
-    interval, errors = _sampled(table, time_unit), values.get("standard_error")
-    others: dict[str, Any] = {"name": columns.file, "units": units, "notes": tuple(notes)}
+    others: dict[str, Any] = {"name": table.file, "units": units, "notes": tuple(notes)}
     others["correlated"] = bool(np.any(values.get("correlated", np.zeros(1)) == 1.0))
     others["freedom"] = float(np.median(values.get("freedom", np.full(1, np.inf))))
+    interval, errors = _sampled(table, time_unit), values.get("standard_error")
     held = values.get("hold_interval", np.full(1, np.nan))
     if interval is None and errors is not None and np.isfinite(held).all():
         return held_data(w[used], response[used], errors[used], float(held[0]), **others)
@@ -214,7 +200,8 @@ def _named(table: Table) -> dict[str, str]:
     """Return the first matching column of each role."""
     found: dict[str, str] = {}
     for name in table.names:
-        bare = split_header(name)[0].rpartition(".")[2] if not table.is_text else split_header(name)[0]
+        bare = split_header(name)[0]
+        bare = bare if table.is_text else bare.rpartition(".")[2]
         for role, usual in NAMES.items():
             if bare.strip().lower() in usual:
                 found.setdefault(role, name)
@@ -223,60 +210,57 @@ def _named(table: Table) -> dict[str, str]:
 
 def _rate(table: Table, name: str) -> tuple[float, str]:
     """Return the factor from a frequency unit to rad per unit of time, and that unit of time."""
-    unit = (split_header(name)[1] or "").strip()
+    bare, unit = split_header(name)
+    unit = (unit or "").strip()
     if unit.lower() in HERTZ:
         # Millihertz and megahertz differ only in case.
         return 2.0 * math.pi * (1e6 if unit.startswith("MH") else HERTZ[unit.lower()]), "s"
     found = re.fullmatch(r"rad(?:ians?)?\s*(?:/|per)\s*(\S+)", unit)
     if found is None:
-        raise DataError(
-            f"{table.head}: the column {name!r} must say its unit, [Hz] or [rad/s]; write for example "
-            f"'{split_header(name)[0]} [rad/s]'"
-        )
+        example = f"[Hz] or [rad/s]; write for example '{bare} [rad/s]'"
+        raise DataError(f"{table.head}: the column {name!r} must have a unit, {example}")
     return 1.0, found[1]
 
 
-def _complex(table: Table, chosen: dict[str, str], values: dict[str, Array], pair: tuple[str, str]) -> ComplexArray:
+def _complex(table: Table, names: dict[str, str], values: dict[str, Array], pair: tuple[str, str]) -> ComplexArray:
     """Return complex values from real and imaginary part, or from gain and phase with their units."""
     first, second = (values[role] for role in pair)
     if pair == ("real", "imaginary"):
         return np.asarray(first + 1j * second)
-    (name, unit), (phase_name, phase_unit) = (split_header(chosen[role]) for role in pair)
+    (name, unit), (phase_name, phase_unit) = (split_header(names[role]) for role in pair)
     if name.lower().endswith("_db") or (unit or "").lower().startswith("db"):
         first = 10.0 ** (first / 20.0)
     angle = (phase_unit or phase_name.rpartition("_")[2]).lower()
     if angle.startswith(("deg", "°")):
         second = np.deg2rad(second)
     elif not angle.startswith("rad"):
-        raise DataError(f"{table.head}: the column {chosen['phase']!r} must say its unit, [deg] or [rad]")
+        raise DataError(f"{table.head}: the column {names['phase']!r} must have a unit, [deg] or [rad]")
     return np.asarray(first * np.exp(1j * second))
 
 
 def _sampled(table: Table, time_unit: str) -> float | None:
     """Return the sampling interval from the comments of a file; 0 for G(jw), None if not stated."""
-    said: dict[str, tuple[int, str]] = {}
+    comments: dict[str, tuple[str, str]] = {}
     for line, text in table.comments:
         found = re.fullmatch(r"\s*(?:#|%|//)\s*(hold|interval)\s*[:=]\s*(.*?)\s*", text, re.IGNORECASE)
         if found:
-            said[found[1].lower()] = (line, found[2])
-    if not said:
+            comments[found[1].lower()] = f"{table.file}:{line}", found[2]
+    if not comments:
         return None
-    if "hold" not in said:
-        line, _ = said["interval"]
-        raise DataError(f"{table.file}:{line}: an interval needs the hold of the input too; add the line '# hold: zoh'")
-    line, hold = said["hold"]
+    place, hold = comments.get("hold", (comments.get("interval", ("",))[0], ""))
+    if not hold:
+        raise DataError(f"{place}: an interval needs the hold of the input too; add the line '# hold: zoh'")
     if hold.lower() in ("none", "band-limited"):
         return 0.0
     if hold.lower() != "zoh":
-        raise DataError(f"{table.file}:{line}: hold must be {listed(('zoh', 'none'))}, not {hold!r}: no other is known")
-    if "interval" not in said:
-        raise DataError(f"{table.file}:{line}: hold zoh needs the sampling interval; add a line '# interval: 0.05'")
-    line, text = said["interval"]
-    number = re.fullmatch(rf"(\S+?)\s*(?:{re.escape(time_unit)})?", text)
+        raise DataError(f"{place}: hold must be zoh or none, not {hold!r}")
+    if "interval" not in comments:
+        raise DataError(f"{place}: hold zoh needs the sampling interval; add a line '# interval: 0.05'")
+    place, text = comments["interval"]
     try:
-        interval = float(number[1] if number else text)
+        interval = float(text.removesuffix(time_unit))
     except ValueError:
         interval = math.nan
     if not 0.0 < interval < math.inf:
-        raise DataError(f"{table.file}:{line}: interval must be a positive number [{time_unit}], not {text!r}")
+        raise DataError(f"{place}: interval must be a positive number [{time_unit}], not {text!r}")
     return interval

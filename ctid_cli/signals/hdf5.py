@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals.files import MAX_FILE_BYTES, MAX_VALUES
+from ctid_cli.signals.files import MAX_FILE_BYTES, require_values
 
 #: Maximum depth of groups, number of members of a file, and bytes of an attribute.
 MAX_DEPTH, MAX_MEMBERS, MAX_ATTRIBUTE = 16, 1_000_000, 1_000_000
@@ -20,31 +20,29 @@ MAX_DATA_SETS, MAX_UNIT = 10_000, 60
 NUMERIC = ("double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 
 
-def _items(
-    group: Any, name: str = "", depth: int = 0, counter: Iterator[int] | None = None
-) -> Iterator[tuple[str, Any]]:
+def _items(group: Any, name: str = "", depth: int = 0, count: Iterator[int] | None = None) -> Iterator[tuple[str, Any]]:
     """Yield all groups and data sets with their paths; refuse links, external data and unbounded sizes."""
     import h5py
 
-    counter = counter or itertools.count()
+    count = count or itertools.count()
     _require_small_attributes(group, name)
     for key in group:
         path = f"{name}/{key}" if name else key
-        told = path[:60]
+        quoted = repr(path[:60])
         if not isinstance(group.get(key, getlink=True), h5py.HardLink):
-            raise DataError(f"{told!r} in it is a link to another place; only what is in the file itself is read")
-        if next(counter) >= MAX_MEMBERS or depth >= MAX_DEPTH:
+            raise DataError(f"{quoted} in it is a link to another place; only what is in the file itself is read")
+        if next(count) >= MAX_MEMBERS or depth >= MAX_DEPTH:
             raise DataError("it holds too many groups or data sets")
         item = group[key]
         if isinstance(item, h5py.Dataset):
             if item.external or item.is_virtual:
-                raise DataError(f"{told!r} in it lies in another file; only what is in the file itself is read")
-            if item.size is not None and (item.size > MAX_VALUES or item.nbytes > MAX_FILE_BYTES):
-                raise DataError(f"{told!r} in it claims to hold {item.size} values; at most {MAX_VALUES} are read")
+                raise DataError(f"{quoted} in it lies in another file; only what is in the file itself is read")
+            if item.size is not None:
+                require_values(f"{quoted} in it", max(item.size, item.nbytes // 8))
             _require_small_attributes(item, path)
         yield path, item
         if isinstance(item, h5py.Group):
-            yield from _items(item, path, depth + 1, counter)
+            yield from _items(item, path, depth + 1, count)
 
 
 def _require_small_attributes(item: Any, name: str) -> None:
@@ -87,10 +85,11 @@ def hdf5_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str,
                 if len(arrays) >= MAX_DATA_SETS:
                     raise DataError("it holds too many groups or data sets")
                 unit = text_of(item.attrs.get("unit", ""))[:MAX_UNIT].strip("[]() ")
-                value = item[()] if kind in NUMERIC and item.dtype.kind in PLAIN else np.array("text", dtype=object)
-                arrays[f"{name} [{unit}]" if unit else name] = (
-                    np.empty((0, 0)) if "MATLAB_empty" in item.attrs else value
-                )
+                if "MATLAB_empty" in item.attrs:
+                    value = np.empty((0, 0))
+                else:
+                    value = item[()] if kind in NUMERIC and item.dtype.kind in PLAIN else np.array("text", dtype=object)
+                arrays[f"{name} [{unit}]" if unit else name] = value
     return arrays, objects
 
 

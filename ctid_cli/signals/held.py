@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import get_args
@@ -11,8 +12,9 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.signals.band_limited import finer_times, finer_values, values_between
-from ctid_cli.signals.checks import freeze, require_increasing
+from ctid_cli.signals.band_limited import finer_times, finer_values, periodic_values, values_between
+from ctid_cli.signals.checks import freeze
+from ctid_cli.signals.data_checks import Rows, check_times
 from ctid_cli.signals.treatment import Hold as Hold
 
 #: Instants closer than this fraction of the shortest break interval count as the same instant: ``k * 0.05`` and
@@ -67,9 +69,9 @@ class HeldSignal:
             raise DataError(f"a held signal needs times and values of one equal, non-zero length; got {shapes}")
         if self.hold not in get_args(Hold):
             raise DataError(f"hold must be 'zoh', 'foh' or 'band-limited', not {self.hold!r}")
-        if not (np.isfinite(t).all() and np.isfinite(values).all()):
-            raise DataError("the input holds a value or a time that is not a finite number")
-        require_increasing("input times", t)
+        if not np.isfinite(values).all():
+            raise DataError(f"{Rows().at(int(np.argmin(np.isfinite(values))))}the input is not a finite number")
+        check_times(t, "the time of the input", Rows())
         if self.hold == "band-limited" and regular_interval(t) is None:
             raise DataError("a band-limited input needs a regular clock; take straight lines between its samples (foh)")
         freeze(self, t=t, values=values)
@@ -85,23 +87,20 @@ class HeldSignal:
     @cached_property
     def lines(self) -> HeldSignal:
         """The signal for exact simulation: itself, or for a band-limited one, straight lines on a finer clock."""
-        return self._in_lines(periodic=False)
+        return self._finer(finer_values) if self.hold == "band-limited" else self
 
     @cached_property
     def periodic_lines(self) -> HeldSignal:
         """Straight lines of a signal that repeats one interval after its last sample."""
-        return self._in_lines(periodic=True)
-
-    def _in_lines(self, *, periodic: bool) -> HeldSignal:
-        if self.hold != "band-limited":
-            return self
-        times = finer_times(self.t, periodic=periodic)
-        return HeldSignal(times, finer_values(self.values, periodic=periodic), "foh")
+        return self._finer(periodic_values, periodic=True) if self.hold == "band-limited" else self
 
     @cached_property
     def _between(self) -> HeldSignal:
         """The values of a band-limited signal on a clock fine enough for straight lines."""
-        return HeldSignal(finer_times(self.t, periodic=False), values_between(self.values), "foh")
+        return self._finer(values_between)
+
+    def _finer(self, values_of: Callable[[Array], Array], *, periodic: bool = False) -> HeldSignal:
+        return HeldSignal(finer_times(self.t, periodic=periodic), values_of(self.values), "foh")
 
     @cached_property
     def mean(self) -> float:
@@ -130,21 +129,6 @@ class HeldSignal:
         else:
             held = np.interp(instants, self.t, self.values)
         return np.where(index < 0, 0.0, held)
-
-    def delayed(self, delay: float) -> HeldSignal:
-        """Return the signal delayed by ``delay``.
-
-        Parameters
-        ----------
-        delay : float
-            Shift [s].
-
-        Returns
-        -------
-        HeldSignal
-            Signal with every break moved by ``delay``.
-        """
-        return HeldSignal(self.t + delay, self.values, self.hold)
 
 
 def hold_factor(hold: Hold, frequencies: Array, interval: float) -> ComplexArray:

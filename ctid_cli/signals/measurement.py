@@ -125,44 +125,37 @@ def read_measurement(
     it is selected by its name including the unit. Several inputs are named by their columns, and may have different
     holds.
     """
-    first, *others = [input] if input is None or isinstance(input, str) else input
-    holds = [hold] * (1 + len(others)) if isinstance(hold, str) else hold
+    several = [input] if input is None or isinstance(input, str) else list(input)
+    holds = [hold] * len(several) if isinstance(hold, str) else hold
     for one in holds:
         require_choice("hold", one, get_args(Hold))
-    roles = ["input", *(f"input {k}" for k in range(2, len(others) + 2))]
-    asked = {"time": time, "input": first, "output": output, "reference": reference}
-    asked |= dict(zip(roles[1:], others, strict=True))
-    columns = open_table(path).select(asked, in_seconds=in_seconds)
-    t, notes = columns.values["time"], columns.notes
+    roles = ["input", *(f"input {k}" for k in range(2, len(several) + 1))]
+    wanted = {"time": time, "input": several[0], "output": output, **dict(zip(roles, several, strict=True))}
+    columns = open_table(path).select({**wanted, "reference": reference}, in_seconds=in_seconds)
+    t, file, notes = columns.values["time"], columns.rows.name, columns.notes
     used = columns.window(t, start, stop)
     if (count := used.stop - used.start) < t.size:
-        span = f"from {t[used.start]:.6g} to {t[used.stop - 1]:.6g} {columns.unit('time') or 's'}"
+        span = f"from {t[used.start]:.6g} to {t[used.stop - 1]:.6g} {columns.time_unit}"
         part = f"Only the {count} of {t.size} samples {span} are used; the input before them is not."
         notes = (*notes, part)
     names = [split_header(columns.names[role])[0] for role in roles]
-    each = zip(names, roles, holds, strict=True)
-    inputs = {name: HeldSignal(t[used], columns.input(used, role), own) for name, role, own in each}
-    y = columns.output(used)
-    if len(inputs) < len(names):
-        raise DataError(f"{columns.file}: each input needs a name of its own; these are {', '.join(names)}")
-    r = None if reference is None else columns.input(used, "reference")
-    record = Record(t[used], y, inputs if others else next(iter(inputs.values())), name=columns.file)
+    if len(set(names)) < len(names):
+        raise DataError(f"{file}: each input needs a name of its own; these are {', '.join(names)}")
+    inputs: dict[str, Any] = {
+        name: HeldSignal(t[used], columns.input(used, role), own)
+        for name, role, own in zip(names, roles, holds, strict=True)
+    }
+    only_one = len(inputs) == 1
+    record = Record(t[used], columns.output(used), inputs[names[0]] if only_one else inputs, name=file)
     known: dict[str, Any] = {role: columns.names[role] for role in ROLES}
     known |= {f"{role}_unit": columns.unit(role) for role in ROLES}
-    if others:
+    if not only_one:
         units = [columns.unit(role) for role in roles]
         known["input_unit"] = SEPARATOR.join(unit or "in" for unit in units) if any(units) else None
         known["inputs"] = tuple(columns.names[role] for role in roles)
-    return Measurement(
-        record,
-        **known,
-        start=start,
-        stop=stop,
-        notes=notes,
-        path=Path(path),
-        reference=columns.names.get("reference"),
-        reference_values=r,
-    )
+    if reference is not None:
+        known |= {"reference": columns.names["reference"], "reference_values": columns.input(used, "reference")}
+    return Measurement(record, **known, start=start, stop=stop, notes=notes, path=Path(path))
 
 
 def read_held_signal(

@@ -87,45 +87,35 @@ class Multisine(checks.Checked, Excitation):
         super().__post_init__()
         if self.frequencies is None:
             self._check_band()
+            highest, filled = self.band[1], self.tones is None
         else:
-            self._check_no_band()
-        if self.period is not None:
-            self._check_harmonics(self.period)
-        if self.frequencies is not None and self.frequencies_used.size < len(self.frequencies):
-            harmonic = "" if self.period is None else ", or fall on the same harmonic of the period"
-            raise OptionError("frequencies", f"two of the frequencies are the same{harmonic}; leave one out.")
+            for name in ("lowest_frequency", "highest_frequency", "tones", "spacing"):
+                if getattr(self, name) != getattr(type(self), name):
+                    raise OptionError(name, f"{name} is of a band, and frequencies are given; keep one of the two.")
+            highest, filled = max(self.frequencies, default=0.0), False
+        most = MAX_FILLED if filled else MAX_HARMONIC
+        if self.period is not None and highest * self.period / (2 * math.pi) > most:
+            raise OptionError("period", f"the tones reach beyond harmonic {most} of the period; give a shorter one.")
         if self.frequencies_used.size == 0:
-            none = f"there is no harmonic of {2 * math.pi / (self.period or 1.0):g} rad/s in the band"
-            raise OptionError("period", f"{none}; give a longer period, or a wider band.")
-
-    def _check_harmonics(self, period: float) -> None:
-        highest = self.band[1] if self.frequencies is None else max(self.frequencies)
-        what, most = "the tones are", MAX_HARMONIC
-        if self.tones is None and self.frequencies is None:
-            what, most = "a band without tones is filled", MAX_FILLED
-        if highest * period / (2 * math.pi) > most:
-            raise OptionError("period", f"{what} up to harmonic {most} of the period; give a shorter one.")
-
-    def _check_no_band(self) -> None:
-        for name in ("lowest_frequency", "highest_frequency", "tones", "spacing"):
-            if getattr(self, name) != getattr(type(self), name):
-                raise OptionError(name, f"{name} is of a band, and frequencies are given; keep one of the two.")
+            raise OptionError(
+                "period", "the band contains no harmonic of the period; widen the band, or give a longer one."
+            )
+        if self.frequencies is not None and self.frequencies_used.size < len(self.frequencies):
+            raise OptionError("frequencies", "two of the frequencies, or their harmonics, are the same; leave one out.")
 
     def _check_band(self) -> None:
         for name in ("lowest_frequency", "highest_frequency"):
             if getattr(self, name) is None:
                 raise OptionError(name, f"{name} is missing [rad/s]; give a band, or a list of frequencies.")
+        if self.tones is None and (self.period is None or self.spacing == "logarithmic"):
+            why = "with a period and linear spacing it may be left out"
+            raise OptionError("tones", f"tones is missing, the number of tones; {why}.")
         low, high = self.band
-        if self.tones is None and self.period is None:
-            raise OptionError("tones", "tones is missing: the number of tones; with a period it may be left out.")
-        if self.tones is None and self.spacing == "logarithmic":
-            raise OptionError("tones", "tones is missing: the number of tones that are spaced logarithmically.")
-        ends = f"{low:g} and {high:g} rad/s"
         if low > high:
-            message = f"lowest_frequency must not exceed highest_frequency; they are {ends}."
+            message = f"lowest_frequency must not exceed highest_frequency; they are {low:g} and {high:g} rad/s."
             raise OptionError("lowest_frequency", message)
         if (self.tones or 1) > 1 and low == high:
-            raise OptionError("tones", f"{self.tones} tones need a band, but its ends are {ends}.")
+            raise OptionError("tones", f"{self.tones} tones need a band, but its ends are both {low:g} rad/s.")
 
     @property
     def band(self) -> tuple[float, float]:
@@ -165,21 +155,13 @@ class Multisine(checks.Checked, Excitation):
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """Return the sum on its clock, which must be fast enough for the highest tone; phases may be random."""
-        clock = clock_instants(sample_times, self.clock_period)
-        frequencies = self.frequencies_used
-        _require_carried(clock, float(frequencies[-1]))
-        elapsed = clock - clock[0]
-        total = np.zeros(clock.size)
+        clock, frequencies = clock_instants(sample_times, self.clock_period), self.frequencies_used
+        elapsed, total = clock - clock[0], np.zeros(clock.size)
+        mean_period = elapsed[-1] / (clock.size - 1) if clock.size > 1 else math.inf
+        if frequencies[-1] >= (limit := math.pi / mean_period):
+            most = f"{limit:g} rad/s = pi / {mean_period:g} s, the most its clock can carry; lower one or the other"
+            raise DataError(f"the multisine's highest tone, {frequencies[-1]:g} rad/s, is not below {most}")
         # One tone at a time: a table of all tones at all instants would not fit in memory for long records.
         for frequency, phase in zip(frequencies, self._phases(rng), strict=True):
             total += np.cos(frequency * elapsed + phase)
         return HeldSignal(clock, self.amplitude * math.sqrt(2 / frequencies.size) * total)
-
-
-def _require_carried(clock: Array, highest: float) -> None:
-    """Refuse a highest tone [rad/s] that is too high for the mean period of the clock."""
-    mean_period = (clock[-1] - clock[0]) / (clock.size - 1) if clock.size > 1 else math.inf
-    limit = math.pi / mean_period
-    if highest >= limit:
-        most = f"{limit:g} rad/s = pi / {mean_period:g} s, the most its clock can carry; lower one or the other"
-        raise DataError(f"the multisine's highest tone, {highest:g} rad/s, is not below {most}")

@@ -15,8 +15,6 @@ Role = Literal["input", "sampling", "noise", "start", "parameters"]
 
 #: First component of every spawn key. Results are repeatable only if these numbers never change.
 ROLES: dict[Role, int] = {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4}
-Decibels = Annotated[float, require_finite, "dB"] | None
-Variance = Annotated[float, require_not_negative, "output unit^2"] | None
 #: Unit of every noise level option.
 LEVEL_UNITS = {
     "snr_db": "dB",
@@ -26,6 +24,17 @@ LEVEL_UNITS = {
 }
 #: Largest absolute signal-to-noise ratio; the variance ratio of much larger ones cannot be represented.
 MAX_SNR_DB = 1000
+
+
+def _require_decibels(name: str, value: float, label: str = "") -> None:
+    """Refuse a ratio of variances that cannot be represented."""
+    require_finite(name, value, "dB", label)
+    if abs(value) > MAX_SNR_DB:
+        raise OptionError(name, f"{name} must be within plus or minus {MAX_SNR_DB} dB, not {value!r}.")
+
+
+Decibels = Annotated[float, _require_decibels] | None
+Variance = Annotated[float, require_not_negative, "output unit^2"] | None
 
 
 def stream(seed: int, role: Role, replicate: int, number: int = 0) -> np.random.Generator:
@@ -56,11 +65,9 @@ class Noise(Checked):
         levels = {name: getattr(self, name) for name in LEVEL_UNITS if hasattr(self, name)}
         given = [name for name, value in levels.items() if value is not None]
         if len(given) != 1:
-            choices = [f"{name} [{LEVEL_UNITS[name]}]" for name in levels]
+            choices = ", ".join(f"{name} [{LEVEL_UNITS[name]}]" for name in levels)
             found = f"{' and '.join(given)} were" if given else "none was"
-            raise ValueError(f"noise needs exactly one of {', '.join(choices)}; {found} given.")
-        if self.snr_db is not None and abs(self.snr_db) > MAX_SNR_DB:
-            raise OptionError("snr_db", f"snr_db must be within plus or minus {MAX_SNR_DB} dB, not {self.snr_db!r}.")
+            raise ValueError(f"noise needs exactly one of {choices}; {found} given.")
 
     @property
     def filter(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -89,24 +96,16 @@ class Noise(Checked):
             return float(variance)
         if (deviation := getattr(self, "standard_deviation", None)) is not None:
             return float(deviation**2)
-        variance = self.variance if self.snr_db is None else _variance_at(self.snr_db, noise_free)
-        assert variance is not None  # one level is always given
+        if (variance := self.variance) is None:
+            if noise_free is None:
+                raise DataError("a signal-to-noise ratio is relative to a noise-free output; give that")
+            power = float(np.mean(noise_free**2))
+            if power == 0.0:
+                why = "the noise-free output is zero, so no noise has a signal-to-noise ratio to it"
+                raise DataError(f"{why}; is the delay longer than the record? Give noise.variance, or a longer record")
+            assert self.snr_db is not None  # one level is always given
+            variance = power / 10 ** (self.snr_db / 10)
         return variance / self._unit_variance
-
-    def variance_of(self, noise_free: Array | None = None) -> float:
-        """Return the variance of the noise: that for unit innovations times the innovation variance.
-
-        Parameters
-        ----------
-        noise_free : ndarray, shape (N,), optional
-            The output without noise [output unit]; needed with a signal-to-noise ratio.
-
-        Returns
-        -------
-        float
-            Variance [output unit^2].
-        """
-        return self._unit_variance * self.innovation_variance_of(noise_free)
 
     def autocovariance(self, lags: ArrayLike, noise_free: Array | None = None) -> Array:
         """Return the covariance of samples at given lags.
@@ -154,7 +153,10 @@ class Noise(Checked):
         DataError
             If the level is a signal-to-noise ratio and the noise-free output is zero throughout.
         """
-        initial = self._state_root @ rng.standard_normal(self._state_root.shape[0])
+        # A symmetric root: the covariance is singular with common zeros of C and D.
+        values, vectors = np.linalg.eigh(self.state_covariance)
+        root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+        initial = root @ rng.standard_normal(values.size)
         shape: Array = rng.standard_normal(noise_free.size)
         if self.coloured:
             from scipy.signal import lfilter
@@ -184,16 +186,9 @@ class Noise(Checked):
         return np.asarray(0.5 * (covariance + covariance.T), dtype=float)
 
     @cached_property
-    def _state_root(self) -> Array:
-        """Symmetric root of the state covariance, which is singular with common zeros of C and D, or an empty G."""
-        values, vectors = np.linalg.eigh(self.state_covariance)
-        return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T, dtype=float)
-
-    @cached_property
     def _unit_variance(self) -> float:
         """Noise variance for unit innovations."""
-        direct = self.state_space[2]
-        return direct**2 + (float(self.state_covariance[0, 0]) if self.state_covariance.size else 0.0)
+        return float(self.state_space[2] ** 2 + self.state_covariance[:1, :1].sum())
 
 
 @dataclass(frozen=True)
@@ -277,40 +272,25 @@ class ArmaNoise(Noise):
     kind: ClassVar[str] = "arma"
     coloured: ClassVar[bool] = True
 
-    numerator: tuple[float, ...]
-    denominator: tuple[float, ...]
+    numerator: tuple[Annotated[float, require_finite, "-"], ...]
+    denominator: tuple[Annotated[float, require_finite, "-"], ...]
     innovation_variance: Variance = None
     variance: Variance = None
     snr_db: Decibels = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("numerator", "denominator"):
-            coefficients = tuple(getattr(self, name))
-            if not coefficients:
-                raise OptionError(name, f"{name} must hold at least one coefficient.")
-            for value in coefficients:
-                require_finite(name, value, "-", label=f"a coefficient of {name}")
-            if coefficients[0] == 0:
-                raise OptionError(name, f"the first coefficient of {name} is zero; it belongs to q^0 and must not be.")
-            object.__setattr__(self, name, tuple(float(value) for value in coefficients))
+            coefficients = tuple(map(float, getattr(self, name)))
+            if not coefficients or coefficients[0] == 0:
+                raise OptionError(name, f"the first coefficient of {name}, which belongs to q^0, must not be zero.")
+            object.__setattr__(self, name, coefficients)
         largest = float(np.abs(np.roots(self.denominator)).max(initial=0.0))
         if largest >= 1.0:
             why = f"denominator has a zero of magnitude {largest:.6g}: the noise would grow without bound"
             raise OptionError("denominator", f"{why}; all must lie inside the unit circle.")
-        super().__post_init__()
 
     @property
     def filter(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Numerator and denominator of the noise filter in ascending powers of q^-1."""
         return self.numerator, self.denominator
-
-
-def _variance_at(snr_db: float, noise_free: Array | None) -> float:
-    """Return the variance of noise at a signal-to-noise ratio [dB] to an output."""
-    if noise_free is None:
-        raise DataError("a signal-to-noise ratio is relative to a noise-free output; give that")
-    power = float(np.mean(noise_free**2))
-    if power == 0.0:
-        why = "the noise-free output is zero, so no noise has a signal-to-noise ratio to it"
-        raise DataError(f"{why}; is the delay longer than the record? Give noise.variance, or a longer record")
-    return power / 10 ** (snr_db / 10)

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
-from ctid_cli.signals.checks import LONGEST, freeze, require_choice, require_increasing, require_scale, require_steps
+from ctid_cli.signals.checks import freeze, require_choice
+from ctid_cli.signals.data_checks import Rows, check_input, check_output, check_times
 from ctid_cli.signals.held import REGULARITY, HeldSignal, Hold, regular_interval
 from ctid_cli.signals.treatment import Holds
 
@@ -73,15 +74,6 @@ class Loop:
         """Whether the controller acts in continuous time."""
         return bool(getattr(self.controller, "continuous", False))
 
-    @property
-    def formula(self) -> str:
-        """Control law: the input from reference r and output y."""
-        sides = (getattr(self.controller, name) for name in ("numerator", "denominator"))
-        b, a = (" ".join(f"{c:.6g}" for c in np.asarray(side)) for side in sides)
-        p = "s" if self.continuous else "q"
-        where = f"u = C({p}) (r - y)" if self.enters == "controller" else f"u = r - C({p}) y"
-        return f"{where}, C = ({b})/({a}) in descending powers of {p}"
-
 
 @dataclass(frozen=True, eq=False)
 class Record:
@@ -127,29 +119,20 @@ class Record:
     def __post_init__(self) -> None:
         t = np.array(self.t, dtype=float)
         y = np.array(self.y, dtype=float)
-        where = f"{self.name}: " if self.name else ""
+        rows = Rows(self.name)
         if t.ndim != 1 or t.shape != y.shape:
             shapes = f"{t.shape} and {y.shape}"
-            raise DataError(f"{where}times and outputs must be one-dimensional and of equal length; got {shapes}")
+            raise DataError(f"{named(self)}times and outputs must be one-dimensional and of equal length; got {shapes}")
         if t.size == 0:
-            raise DataError(f"{where}the record is empty")
-        if not np.isfinite(t).all():
-            raise DataError(f"{where}time of sample {int(np.argmin(np.isfinite(t)))} is not a finite number")
-        require_scale(f"{where}the times", t, LONGEST)
-        require_increasing(f"{where}times", t)
-        if np.isinf(y).any():
-            k = int(np.argmax(np.isinf(y)))
-            raise DataError(f"{where}output of sample {k} is infinite; mark missing samples as NaN")
-        if not np.isfinite(y).any():
-            raise DataError(f"{where}no output sample is a finite number")
-        require_steps(f"{where}the clock", t)
-        require_scale(f"{where}the output", y)
-        object.__setattr__(self, "inputs", _named_inputs(self.inputs, t, where))
+            raise DataError(f"{named(self)}the record is empty")
+        check_times(t, "the time", rows)
+        check_output(y, "the output", rows)
+        object.__setattr__(self, "inputs", _named_inputs(self.inputs, t, named(self)))
         for name, signal in self.held.items():
-            require_scale(f"{where}the input{f' {name}' * self.several}", signal.values)
+            check_input(signal.values, f"the input {name}" if self.several else "the input", rows)
         freeze(self, t=t, y=y)
         if self.loop is not None:
-            self._require_loop(self.loop, where)
+            self._require_loop(self.loop)
 
     def __repr__(self) -> str:
         clock = "irregular clock" if self.interval is None else f"every {self.interval:.6g} s"
@@ -160,7 +143,8 @@ class Record:
         span = f"{self.n_samples} samples from {self.t[0]:g} to {self.t[-1]:g} s"
         return f"Record({name}{span}, {clock}{missing}{inputs}{loop})"
 
-    def _require_loop(self, loop: Loop, where: str) -> None:
+    def _require_loop(self, loop: Loop) -> None:
+        where = named(self)
         if loop.reference.size != self.t.size:
             raise DataError(f"{where}the reference has {loop.reference.size} values for {self.t.size} samples")
         if loop.continuous or loop.controller is None:
@@ -246,21 +230,6 @@ class Record:
         """The record with each of its inputs separately."""
         return [self.of_input(name) for name in self.held]
 
-    def driven_by(self, **inputs: HeldSignal) -> Record:
-        """Return the record with some of its inputs replaced.
-
-        Parameters
-        ----------
-        **inputs : HeldSignal
-            New inputs by name.
-
-        Returns
-        -------
-        Record
-            The changed record.
-        """
-        return replace(self, inputs={**self.held, **inputs})
-
     def of_input(self, name: str) -> Record:
         """Return the record with only one of its inputs.
 
@@ -268,11 +237,6 @@ class Record:
         ----------
         name : str
             Name of the input.
-
-        Returns
-        -------
-        Record
-            The record, its output unchanged.
         """
         return replace(self, inputs={name: self.held[name]}) if self.several else self
 
@@ -325,11 +289,10 @@ def beginning(record: Record, samples: int) -> Record:
     if record.n_samples <= samples:
         return record
     t = record.t[:samples]
-    known = {name: signal.t <= t[-1] for name, signal in record.held.items()}
-    inputs = {
-        name: HeldSignal(signal.t[known[name]], signal.values[known[name]], signal.hold)
-        for name, signal in record.held.items()
-    }
+    inputs = {}
+    for name, signal in record.held.items():
+        known = signal.t <= t[-1]
+        inputs[name] = HeldSignal(signal.t[known], signal.values[known], signal.hold)
     return Record(t, record.y[:samples], inputs, name=record.name)
 
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.signals.checks import LONGEST, require_positive, require_scale, require_steps
+from ctid_cli.signals.checks import require_positive
+from ctid_cli.signals.data_checks import LONGEST, Rows, check_output, require_scale
 from ctid_cli.signals.measurement import open_table
 from ctid_cli.signals.sound import is_sound, read_sound
 from ctid_cli.signals.table import Columns, Table, split_header
@@ -81,71 +82,66 @@ def read_sampled_signal(
         interval, signal = interval or 1.0 / rate, signal or table.names[0]
     else:
         table = open_table(path)
-    columns = _selected(table, time, signal, without_times=interval is not None)
-    column, times = columns.names["signal"], columns.names.get("time")
+    columns = _selected(table, {"time": time, "signal": signal}, without_times=interval is not None)
     values, notes, first = columns.values["signal"], list(columns.notes), 0.0
+    times: str | None = columns.names.get("time")
     time_unit: str | None = "s"
-    if np.isinf(values).any():
-        values = np.where(np.isinf(values), np.nan, values)
     if interval is None:
         time_unit, first = columns.unit("time"), float(columns.values["time"][0])
-        values, interval, missing = _on_grid(columns, values, time_unit or "s")
+        values, interval, missing = _on_grid(columns, values)
         notes += missing
     elif times is not None:
         notes.append(f"The times {times!r} are not used, since the sampling interval was given.")
         times = None
-    require_steps(f"{table.file}: the clock", np.array([0.0, interval]))
-    require_scale(f"{table.file}: the clock", np.array([interval]), LONGEST)
+    require_scale(np.array([interval]), "the clock", Rows(table.file), LONGEST)
     used = slice(0, values.size)
     if start is not None or stop is not None:
         instants = first + interval * np.arange(values.size, dtype=float)
         used = columns.window(instants, start, stop, 1e-6 * interval)
-    values = values[used]
-    if not np.isfinite(values).any():
-        raise DataError(f"{table.file}: no sample of {column!r} is a finite number")
-    require_scale(f"{table.file}: the signal {column!r}", values)
+    values = np.where(np.isinf(values), np.nan, values)[used]
+    column = columns.names["signal"]
+    check_output(values, f"signal {column!r}", Rows(table.file, before=used.start))
     name, unit = split_header(column)
     begin = first + used.start * interval
     return SampledSignal(values, interval, begin, table.file, name, times, time_unit, unit, tuple(notes))
 
 
-def _selected(table: Table, time: str | None, signal: str | None, *, without_times: bool) -> Columns:
+def _selected(table: Table, wanted: dict[str, str | None], *, without_times: bool) -> Columns:
     """Read the signal, and its times unless they are given otherwise."""
-    asked = {"time": time, "signal": signal}
     try:
-        return table.select(asked, without_times=without_times)
+        return table.select(wanted, without_times=without_times)
     except DataError as error:
         if without_times:
             raise
-        table.select(asked | {"time": None}, without_times=True)  # raises if the signal itself is wrong
+        table.select({**wanted, "time": None}, without_times=True)  # raises if the signal itself is wrong
         raise DataError(f"{error}; or give the clock (--interval SECONDS or --rate HERTZ)") from None
 
 
-def _on_grid(columns: Columns, values: Array, unit: str) -> tuple[Array, float, list[str]]:
+def _on_grid(columns: Columns, values: Array) -> tuple[Array, float, list[str]]:
     """Return samples at all instants of the grid of the times, its interval, and notes on missing samples."""
-    t = columns.values["time"]
+    t, unit, file = columns.values["time"], columns.time_unit, columns.rows.name
     if t.size < 2:
-        raise DataError(f"{columns.file}: one sample has no frequency")
+        raise DataError(f"{file}: one sample has no frequency")
     steps = np.diff(t)
-    places, interval, stray = _nearest_grid(t, float(np.median(steps)))
+    places, interval, distance = _nearest_grid(t, float(np.median(steps)))
     tolerance = 4 * np.finfo(float).eps * float(np.abs(t).max())
-    worst = int(np.argmax(stray))
-    if stray[worst] > CLOCK_TOLERANCE * interval + tolerance:
+    worst = int(np.argmax(distance))
+    if distance[worst] > CLOCK_TOLERANCE * interval + tolerance:
+        off = f"{t[worst]:.9g} {unit} is {distance[worst]:.3g} {unit} off a grid of {interval:.6g} {unit}"
         # If most neighbours of a sample are missing, the median is a multiple of the interval.
-        beside = f"{t[worst]:.9g} {unit} lies {stray[worst]:.3g} {unit} beside a grid of {interval:.6g} {unit}"
-        places, interval, stray = _nearest_grid(t, float(steps.min()))
-        if not stray.max() <= CLOCK_TOLERANCE * interval + tolerance:
+        places, interval, distance = _nearest_grid(t, float(steps.min()))
+        if not distance.max() <= CLOCK_TOLERANCE * interval + tolerance:
             ways = "Resample the record, or give its clock (--interval or --rate) if its times are only rounded"
-            raise DataError(f"{columns.place(worst)}: the clock is not regular: {beside}. {ways}")
-    if places[-1] > MOST_FILLED * t.size:
-        some = f"of {places[-1] + 1:.6g} instants of a clock of {interval:.6g} {unit} the file has only {t.size}"
-        raise DataError(f"{columns.file}: {some}; use a part with fewer gaps (--from, --to), or resample the record")
-    if places[-1] + 1 == t.size:
+            raise DataError(f"{columns.rows.at(worst)}the clock is not regular: {off}. {ways}")
+    count = int(places[-1]) + 1
+    if count > MOST_FILLED * t.size:
+        some = f"of {count} instants of a clock of {interval:.6g} {unit} the file has only {t.size}"
+        raise DataError(f"{file}: {some}; use a part with fewer gaps (--from, --to), or resample the record")
+    if count == t.size:
         return values, interval, []
-    filled = np.full(int(places[-1]) + 1, np.nan)
+    filled = np.full(count, np.nan)
     filled[places.astype(np.int64)] = values
-    left_out = f"The times leave out {filled.size - t.size} instants of the clock; they count as missing."
-    return filled, interval, [left_out]
+    return filled, interval, [f"The times leave out {count - t.size} instants of the clock; they count as missing."]
 
 
 def _nearest_grid(t: Array, usual: float) -> tuple[Array, float, Array]:

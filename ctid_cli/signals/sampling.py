@@ -17,19 +17,6 @@ InputRecord = Literal["sampled", "exact"]
 Samples = Annotated[int, checks.require_integer, 2]
 
 
-def geometric_sizes(first: int, last: int, count: int) -> list[int]:
-    """Return geometrically spaced whole numbers, such as the record lengths of a study of convergence."""
-    checks.require_integer("the first size", first, 1)
-    checks.require_integer("the last size", last, 1)
-    checks.require_integer("the count", count, 2)
-    if first >= last:
-        raise ValueError(f"the first size must be below the last; they are {first} and {last}.")
-    sizes = [int(size) for size in np.rint(np.geomspace(first, last, count))]
-    if len(set(sizes)) < count:
-        raise ValueError(f"there are no {count} different sizes from {first} to {last}, spaced geometrically.")
-    return sizes
-
-
 class Sampling(ABC):
     """Sampling instants of the output, and input information given to the estimator."""
 

@@ -1,7 +1,7 @@
 """Sums of sinusoids with steps in frequency and amplitude, and their disturbances."""
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal, cast
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,7 +31,10 @@ class Piece:
     until: float | None = None
 
 
-def _require_course(name: str, course: float | tuple[Piece, ...], unit: str, label: str = "") -> None:
+Course = float | tuple[Piece, ...]
+
+
+def _require_course(name: str, course: Course, unit: str, label: str = "") -> None:
     """Refuse values that are not positive, and pieces that are not in order."""
     if not isinstance(course, tuple):
         require_positive(name, course, unit)
@@ -43,10 +46,8 @@ def _require_course(name: str, course: float | tuple[Piece, ...], unit: str, lab
     *ends, last = (piece.until for piece in course)
     if last is not None or None in ends:
         raise OptionError(name, f"every piece of {name} but the last needs 'until' [s], and the last has none.")
-    for end in ends:
-        require_positive(name, cast(float, end), "s", label=f"'until' of a piece of {name}")
-    if (np.diff(_ends(course)) <= 0).any():
-        raise OptionError(name, f"the pieces of {name} must follow one another; their ends are {ends} s.")
+    if (np.diff(_ends(course), prepend=0.0) <= 0).any():
+        raise OptionError(name, f"the pieces of {name} must follow one another from 0 s on; their ends are {ends} s.")
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,8 @@ class Tone(Checked):
         If a value is not positive, or the pieces are not in order.
     """
 
-    frequency: Annotated[float | tuple[Piece, ...], _require_course, "rad/s"]
-    amplitude: Annotated[float | tuple[Piece, ...], _require_course, "signal unit"] = 1.0
+    frequency: Annotated[Course, _require_course, "rad/s"]
+    amplitude: Annotated[Course, _require_course, "signal unit"] = 1.0
     phase: Annotated[float, require_finite, "rad"] = 0.0
 
 
@@ -203,9 +204,9 @@ class SineDisturbance(Checked):
     frequency: Annotated[float, require_positive, "rad/s"]
     phase: Annotated[float, require_finite, "rad"] = 0.0
 
-    def at(self, times: ArrayLike) -> Array:
+    def at(self, times: Array) -> Array:
         """Return the disturbance at some instants [signal unit]."""
-        return self.amplitude * np.sin(self.frequency * np.asarray(times, dtype=float) + self.phase)
+        return self.amplitude * np.sin(self.frequency * times + self.phase)
 
 
 Disturbance = UniformDisturbance | SineDisturbance | Noise
@@ -220,34 +221,30 @@ def disturb(signal: Array, times: Array, disturbance: Disturbance | None, rng: n
     return signal + disturbance.generate(signal, rng)
 
 
-def _values(course: float | tuple[Piece, ...]) -> Array:
+def _values(course: Course) -> Array:
     return np.array([piece.value for piece in course] if isinstance(course, tuple) else [course], dtype=float)
 
 
-def _ends(course: float | tuple[Piece, ...]) -> Array:
+def _ends(course: Course) -> Array:
     return np.array([piece.until for piece in course[:-1]] if isinstance(course, tuple) else [], dtype=float)
 
 
-def _steps(courses: list[float | tuple[Piece, ...]]) -> tuple[float, ...]:
-    steps: set[float] = set()
-    for course in courses:
-        changing = np.diff(_values(course)) != 0.0
-        steps.update(_ends(course)[changing].tolist())
-    return tuple(sorted(steps))
+def _steps(courses: list[Course]) -> tuple[float, ...]:
+    changes = [_ends(course)[np.diff(_values(course)) != 0.0] for course in courses]
+    return tuple(np.unique(np.concatenate(changes)).tolist())
 
 
-def _place(course: float | tuple[Piece, ...], t: Array) -> IndexArray:
+def _place(course: Course, t: Array) -> IndexArray:
     """Return the number of the piece at each instant; 3 k 0.1 and k 0.3 count as equal despite rounding."""
-    ends = _ends(course)
-    return np.searchsorted(ends * (1.0 - COINCIDENCE), t, side="right")
+    return np.searchsorted(_ends(course) * (1.0 - COINCIDENCE), t, side="right")
 
 
-def _course_at(course: float | tuple[Piece, ...], t: Array) -> Array:
+def _course_at(course: Course, t: Array) -> Array:
     return np.asarray(_values(course)[_place(course, t)])
 
 
-def _integral(course: float | tuple[Piece, ...], t: Array) -> Array:
-    values, ends = _values(course), np.concatenate(([0.0], _ends(course)))
-    before = np.concatenate(([0.0], np.cumsum(values[:-1] * np.diff(ends))))
+def _integral(course: Course, t: Array) -> Array:
+    values, starts = _values(course), np.concatenate(([0.0], _ends(course)))
+    before = np.concatenate(([0.0], np.cumsum(values[:-1] * np.diff(starts))))
     place = _place(course, t)
-    return np.asarray(before[place] + values[place] * (t - ends[place]))
+    return np.asarray(before[place] + values[place] * (t - starts[place]))

@@ -3,19 +3,20 @@
 import codecs
 import csv
 import io
-import itertools
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
 from ctid_cli.errors import DataError
+from ctid_cli.signals.data_checks import Rows
 from ctid_cli.signals.files import quoted, require_file
-from ctid_cli.signals.table import Columns, Table, split_header
+from ctid_cli.signals.table import Found, Table, split_header
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -25,13 +26,13 @@ HEAD_LINES, HEAD_BYTES = 50, 1_000_000
 #: Maximum number of columns.
 MAX_COLUMNS = 10_000
 #: Rows converted at once: memory is needed for these and for the numbers of the used columns.
-ROWS = 1 << 17
+CHUNK = 1 << 17
 #: Separators in order of preference; the blank stands for any number of blanks and tabs.
 SEPARATORS = ("\t", ";", ",", " ")
 #: Prefixes of comments, which are allowed before the data.
 COMMENTS = ("#", "%", "//")
 #: Notations of a missing sample.
-MISSING = ("", "nan", "NaN", "NAN", "na", "NA")
+MISSING = ("", "nan", "NaN", "NAN", "na", "NA", "N/A", "#N/A")
 #: Digits, a sign and digits again, as in 2024-03-01, 1/3/24 or 12:30.
 DATE = re.compile(r"\d[-/.]\d{1,2}[-/.]\d|\d:\d\d")
 #: A number by its decimal sign.
@@ -39,8 +40,9 @@ NUMBERS = {
     sign: re.compile(rf"[+-]?(\d+{mark}?\d*|{mark}\d+)(e[+-]?\d+)?|[+-]?inf(inity)?|true|false", re.IGNORECASE)
     for sign, mark in ((".", r"\."), (",", ","))
 }
-EMPTY = "1: the file is empty; its first line must name the columns"
-NO_TEXT = "this is not a text file; records are read from text (.csv, .txt), MATLAB files (.mat) and HDF5 files (.h5)"
+NO_DATA = "the file has a header and no data"
+TEXT = "this is not a text file in UTF-8, or in UTF-16 with a byte order mark"
+FORMATS = "records are read from text (.csv, .txt), MATLAB files (.mat) and HDF5 files (.h5)"
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,6 @@ class Layout:
     """Layout of a file: encoding, separators, columns, and line numbers of names and first sample."""
 
     path: str | os.PathLike[str]
-    file: str
     encoding: str
     separator: str
     decimal: str
@@ -66,14 +67,18 @@ class Layout:
             text.readline()
         return text
 
+    def error(self, line: int, problem: str) -> DataError:
+        """Return the error about a line."""
+        return DataError(f"{os.fspath(self.path)}:{line}: {problem}")
+
 
 def read_text_table(path: str | os.PathLike[str]) -> Table:
     """Open a text file with one line per instant, whose first line names the columns."""
-    layout = _layout(path, require_file(path, EMPTY))
-    names = tuple(filter(None, layout.columns))
-    head = f"{layout.file}:{layout.header}"
-    read, notes = partial(_read_columns, layout), layout.notes
-    return Table(layout.file, names, read, head=head, is_text=True, notes=notes, comments=layout.comments)
+    file = require_file(path, "1: the file is empty; its first line must name the columns")
+    layout = _layout(path, file)
+    names, head = tuple(filter(None, layout.columns)), f"{file}:{layout.header}"
+    read = partial(_read_columns, layout)
+    return Table(file, names, read, head, is_text=True, notes=layout.notes, comments=layout.comments)
 
 
 # --- first lines ----------------------------------------------------------------------------------
@@ -85,40 +90,33 @@ def _layout(path: str | os.PathLike[str], file: str) -> Layout:
     comments: list[tuple[int, str]] = []
     content: list[tuple[int, str]] = []
     for number, line in enumerate(io.StringIO(text, newline=None), start=1):
-        if line.strip():
+        if line.strip() and len(content) < HEAD_LINES:
             (comments if line.lstrip().startswith(COMMENTS) else content).append((number, line))
-        if len(content) == HEAD_LINES:
-            break
     if not content:
-        raise DataError(f"{file}:{EMPTY}")
+        raise DataError(f"{file}:1: the file has no data; its first line must name the columns")
     separator = _separator([line for _, line in content])
     rows = [(k, _fields(line, separator)) for k, line in content]
-    if not rows[0][1]:
-        raise DataError(f"{file}:{rows[0][0]}: the line names no columns; it must name them, as in t,u,y")
     if _all_numbers(rows[0][1]):
         # Some programs write the column names as a comment.
         before, comment = next(((k, line) for k, line in reversed(comments) if k < rows[0][0]), (0, ""))
         rows.insert(0, (before, _fields(comment.lstrip().lstrip("#%/"), separator)))
         if len(rows[0][1]) != len(rows[1][1]) or _all_numbers(rows[0][1]):
-            wrong = "the first line holds numbers; it must name the columns, for example t,u,y"
+            wrong = "the first line names no columns; it must name them, for example t,u,y"
             raise DataError(f"{file}:{rows[1][0]}: {wrong}")
     header, names = rows[0]
-    notes = []
-    if encoding == "cp1252":
-        notes.append("The file is not UTF-8; it was read as Windows-1252.")
+    notes = ["The file is not UTF-8; it was read as Windows-1252."] if encoding == "cp1252" else []
     if _is_units(rows):
-        names = [_with_unit(*pair) for pair in itertools.zip_longest(names, rows[1][1], fillvalue="")]
+        names = [_with_unit(*pair) for pair in zip_longest(names, rows[1][1], fillvalue="")]
         notes.append(f"Line {rows[1][0]} was taken as the units of the columns.")
         del rows[1]
     if len(names) > MAX_COLUMNS:
         raise DataError(f"{file}:{header}: the line names {len(names)} columns; at most {MAX_COLUMNS} are read")
     if len(rows) < 2:
-        raise DataError(f"{file}:{header + 1}: the file has a header and no data")
-    decimal = _decimal(itertools.chain.from_iterable(fields for _, fields in rows[1:]))
+        raise DataError(f"{file}:{header + 1}: {NO_DATA}")
+    decimal = _decimal(chain.from_iterable(fields for _, fields in rows[1:]))
     if decimal == ",":
         notes.append("Numbers were read with decimal commas.")
-    first = rows[1][0]
-    return Layout(path, file, encoding, separator, decimal, tuple(names), header, first, tuple(notes), tuple(comments))
+    return Layout(path, encoding, separator, decimal, tuple(names), header, rows[1][0], tuple(notes), tuple(comments))
 
 
 def _head(path: str | os.PathLike[str], file: str) -> tuple[str, str]:
@@ -128,10 +126,7 @@ def _head(path: str | os.PathLike[str], file: str) -> tuple[str, str]:
             head = content.read(HEAD_BYTES)
     except OSError as error:
         raise DataError(f"{file}: cannot be read: {error.strerror}") from None
-    # The byte order mark of UTF-32 begins with that of UTF-16.
-    if head.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):
-        encodings = ["utf-32"]
-    elif head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encodings = ["utf-16"]
     else:
         encodings = ["utf-8-sig", "cp1252"] if b"\0" not in head else []
@@ -146,24 +141,25 @@ def _head(path: str | os.PathLike[str], file: str) -> tuple[str, str]:
             if not text:
                 raise DataError(f"{file}:1: the line has more than {HEAD_BYTES} bytes; it must name the columns")
         return text, encoding
-    raise DataError(f"{file}: {NO_TEXT}")
+    raise DataError(f"{file}: {TEXT}; {FORMATS}")
 
 
 def _split(line: str, separator: str) -> list[str]:
-    """Return the fields of a line as written."""
+    """Return the stripped fields of a line."""
     line = line.strip("\r\n")
     if separator == " ":
         # Keep a name and its unit together.
         line = re.sub(r"\s+", " ", re.sub(r"\s+(?=[\[(])", "", line.strip()))
     try:
-        return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+        row = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
     except csv.Error:  # a field of more than 131072 letters
         return []
+    return [field.strip() for field in row]
 
 
 def _fields(line: str, separator: str) -> list[str]:
-    """Return the stripped fields of a line up to the last non-empty one."""
-    fields = [field.strip() for field in _split(line, separator)]
+    """Return the fields of a line up to the last non-empty one."""
+    fields = _split(line, separator)
     while fields and not fields[-1]:
         del fields[-1]
     return fields
@@ -186,11 +182,8 @@ def _separator(lines: Sequence[str]) -> str:
 
 def _decimal(fields: Iterable[str]) -> str:
     """Return the decimal sign used by most of the numbers that have one."""
-    votes = dict.fromkeys(NUMBERS, 0)
-    for field in fields:
-        for sign, number in NUMBERS.items():
-            votes[sign] += sign in field and number.fullmatch(field) is not None
-    return "," if votes[","] > votes["."] else "."
+    found = [sign for field in fields for sign in NUMBERS if sign in field and NUMBERS[sign].fullmatch(field)]
+    return "," if found.count(",") > found.count(".") else "."
 
 
 def _is_units(rows: Sequence[tuple[int, list[str]]]) -> bool:
@@ -218,36 +211,37 @@ def _all_numbers(fields: Sequence[str]) -> bool:
 # --- the columns ----------------------------------------------------------------------------------
 
 
-def _read_columns(layout: Layout, names: Sequence[str]) -> Columns:
+def _read_columns(layout: Layout, names: Sequence[str]) -> Found:
     """Read some columns; lines with only empty fields are left out."""
-    places = [layout.columns.index(name) for name in names]
+    places, width = [layout.columns.index(name) for name in names], len(layout.columns)
     parts: list[Any] = []
     try:
         for frame in _chunks(layout, places):
-            if frame[len(layout.columns)].notna().any():
+            if frame[width].notna().any():
                 raise ValueError("a line has too many fields")
             parts.append(frame[places].to_numpy().T)
     except ValueError as error:  # some field is no number, or a quotation mark is never closed
         _refuse(layout, places, str(error))
     values = np.concatenate(parts, axis=1)
     parts.clear()
-    last = values.shape[1] - 1
     missing = np.isnan(values)
-    doubtful = set(np.flatnonzero(missing.all(axis=0)).tolist()) | ({last} if missing[:, last:].any() else set())
-    left_out, notes = [], []
+    doubtful = set(np.flatnonzero(missing.all(axis=0)).tolist())
+    last, notes = values.shape[1] - 1, []
+    if missing[:, last:].any():
+        doubtful.add(last)
+    empty = []
     for k, line in _lines(layout, doubtful):
-        cut = k == last and not line.endswith(("\r", "\n"))
         if not _fields(line, layout.separator):
-            left_out.append(k)
-        elif cut and len(_split(line, layout.separator)) < len(layout.columns):
-            left_out.append(k)
+            empty.append(k)
+        elif k == last and not line.endswith(("\r", "\n")) and len(_split(line, layout.separator)) < width:
+            empty.append(k)
             notes.append(f"Line {layout.first + k}, the last, breaks off before its last field; it was left out.")
     lines: Any = range(layout.first, layout.first + last + 1)
-    if left_out:
-        values, lines = np.delete(values, left_out, axis=1), np.delete(np.array(lines), left_out)
+    if empty:
+        values, lines = np.delete(values, empty, axis=1), np.delete(np.array(lines), empty)
     if not len(lines):
-        raise DataError(f"{layout.file}:{layout.header + 1}: the file has a header and no data")
-    return Columns(layout.file, dict(zip(names, values, strict=True)), lines, tuple(notes))
+        raise layout.error(layout.header + 1, NO_DATA)
+    return Found(dict(zip(names, values, strict=True)), Rows(os.fspath(layout.path), lines), tuple(notes))
 
 
 def _lines(layout: Layout, rows: set[int]) -> Iterator[tuple[int, str]]:
@@ -284,7 +278,7 @@ def _chunks(layout: Layout, places: Sequence[int]) -> Iterator["DataFrame"]:
     options: Any = {"header": 0, "names": range(width + 1), "usecols": [*places, width], "index_col": False}
     options |= {"sep": r"\s+" if layout.separator == " " else layout.separator, "decimal": layout.decimal}
     options |= {"na_values": list(MISSING), "keep_default_na": False, "skip_blank_lines": False}
-    options |= {"skipinitialspace": True, "dtype": float, "chunksize": ROWS, "engine": "c"}
+    options |= {"skipinitialspace": True, "dtype": float, "chunksize": CHUNK, "engine": "c"}
     with layout.opened() as text:
         widened: Any = _Widened(text, layout)
         yield from pd.read_csv(widened, **options)
@@ -293,32 +287,31 @@ def _chunks(layout: Layout, places: Sequence[int]) -> Iterator["DataFrame"]:
 def _refuse(layout: Layout, places: Sequence[int], error: str) -> NoReturn:
     """Refuse the first line with too many fields or without a number, and quote it."""
     number, width = NUMBERS[layout.decimal], len(layout.columns)
-    if opened := re.search(r"inside string starting at row (\d+)", error):
+    if unclosed := re.search(r"inside string starting at row (\d+)", error):
         why = "a quotation mark is opened and never closed; export the file anew, or correct the line"
-        raise DataError(f"{layout.file}:{layout.first + int(opened[1]) - 1}: {why}")
+        raise layout.error(layout.first + int(unclosed[1]) - 1, why)
     with layout.opened() as text:
         for line, written in enumerate(text, start=layout.first):
-            fields = _fields(written, layout.separator)
-            if len(fields) > width:
-                there = f"the line has {len(fields)} fields where line {layout.header} names {width}"
+            if (count := len(_fields(written, layout.separator))) > width:
+                there = f"the line has {count} fields where line {layout.header} names {width}"
                 commas = "; numbers with decimal commas need another separator, such as the semicolon"
-                raise DataError(f"{layout.file}:{line}: {there}{commas if layout.separator == ',' else ''}")
+                raise layout.error(line, there + commas * (layout.separator == ","))
             for place, field in enumerate(_split(written, layout.separator)):
-                if place in places and field not in MISSING and not number.fullmatch(field := field.strip()):
+                if place in places and field not in MISSING and not number.fullmatch(field):
                     found = f"column {layout.columns[place]!r} holds {quoted(field)}"
-                    raise DataError(f"{layout.file}:{line}: {found}, which is {_instead_of_number(field, layout)}")
-    raise DataError(
-        f"{layout.file}: the columns cannot be read as numbers; write them with digits and one decimal sign"
-    )
+                    raise layout.error(line, f"{found}, which is {_instead_of_number(field, layout.decimal)}")
+    raise layout.error(layout.first, "the columns cannot be read as numbers; write them with one decimal sign")
 
 
-def _instead_of_number(text: str, layout: Layout) -> str:
+def _instead_of_number(text: str, decimal: str) -> str:
     """Describe the text found in place of a number, with a remedy."""
     if DATE.search(text):
         return "a date or a time of day; write times as numbers, such as seconds since the first sample"
     if text.startswith(COMMENTS):
         return "a comment; move comments above the names of the columns, or delete them"
-    other, name = (",", "comma") if layout.decimal == "." else (".", "point")
+    other, name = (",", "comma") if decimal == "." else (".", "point")
     if NUMBERS[other].fullmatch(text):
         return f"a number with a decimal {name}, unlike the first {HEAD_LINES} lines; write all with one decimal sign"
+    if NUMBERS[decimal].fullmatch(re.sub(rf"[{re.escape(other)}' \u00a0\u202f]", "", text)):
+        return "a number with separators between its digits; write it with digits and one decimal sign"
     return "not a number; leave the field empty if the sample is missing"

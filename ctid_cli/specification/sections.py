@@ -22,7 +22,7 @@ from pydantic_core import ErrorDetails
 from ctid_cli.arrays import Array
 from ctid_cli.custom_code import reason
 from ctid_cli.errors import CtidError, OptionError
-from ctid_cli.signals.sampling import geometric_sizes
+from ctid_cli.signals.checks import require_integer
 from ctid_cli.specification.messages import Complaint, explained, option_docs, several_wrong
 from ctid_cli.specification.sweeps import MAX_COMBINATIONS, option_complaints
 from ctid_cli.specification.values import ByShape, Coefficients, Number, OneOf, Swept, Text, Whole
@@ -157,6 +157,19 @@ class Geometric(Section):
         """Return the numbers."""
         first, last, count = self.geometric
         return geometric_sizes(first, last, count)
+
+
+def geometric_sizes(first: int, last: int, count: int) -> list[int]:
+    """Return geometrically spaced whole numbers, such as the record lengths of a study of convergence."""
+    require_integer("the first size", first, 1)
+    require_integer("the last size", last, 1)
+    require_integer("the count", count, 2)
+    if first >= last:
+        raise ValueError(f"the first size must be below the last; they are {first} and {last}.")
+    sizes = [int(size) for size in np.rint(np.geomspace(first, last, count))]
+    if len(set(sizes)) < count:
+        raise ValueError(f"there are no {count} different sizes from {first} to {last}, spaced geometrically.")
+    return sizes
 
 
 def section_for(

@@ -31,9 +31,9 @@ FORMATS = {
 
 def tables(found: StudyResults) -> list[Section]:
     """Return the tables for readers."""
-    said = "`observer`, `filter` and `filter_gradient` are derived, not the published algorithms: the equations of the "
-    said += "two comparators of the paper were not to be had. Frequencies and errors in rad/s, times in s."
-    parts = [Section(sentences=[said])]
+    text = "`observer`, `filter` and `filter_gradient` are derived, not the published algorithms: the equations of the "
+    text += "two comparators of the paper were not to be had. Frequencies and errors in rad/s, times in s."
+    parts = [Section(sentences=[text])]
     for name, title in TITLES.items():
         if name in found:
             parts += [Section(title), *paper_tables(found[name])]
@@ -93,14 +93,14 @@ def recovery_table(results: Results) -> Section:
     rows = recovery(results)
     rows["median"] = times(rows["median"], 3)
     table = across(rows, "reading", READINGS, ["median"], "{0} [s]").rename(index=named).reset_index()
-    said = "Time from the step until both errors are below 1e-6, to stay to the end, 60 s after the step."
-    return Section("Beyond the paper: recovery from the step without noise", [said], table)
+    text = "Time from the step until both errors are below 1e-6, to stay to the end, 60 s after the step."
+    return Section("Beyond the paper: recovery from the step without noise", [text], table)
 
 
 def noisy_recovery_table(results: Results) -> Section:
     """Return recovery times of the frequencies after a step in noise."""
     rows = recovery(results)
-    said = (
+    text = (
         f"White Gaussian noise of standard deviation 0.11547, {rows['data_sets'].max()} data sets for each reading. "
         "Time from the step until both errors are below 0.02, to stay to the end, 60 s after the step. False alarms "
         "over all data sets; rms error: median of the worse tone."
@@ -110,14 +110,14 @@ def noisy_recovery_table(results: Results) -> Section:
     table = across(shown.join(rows[["estimator", "reading", "derived"]]), "reading", READINGS, [*shown], "{0}: {1}")
     table.columns = [name if name.endswith(": median [s]") else name.partition(": ")[2] for name in table]
     table = table.rename(index=named).reset_index()
-    return Section("Beyond the paper: recovery from the step in noise", [said], table, FORMATS)
+    return Section("Beyond the paper: recovery from the step in noise", [text], table, FORMATS)
 
 
 def efficiency_table(results: Results) -> Section:
     """Return errors over the Cramer-Rao bound, including the bias."""
     rows = efficiency(results)
     bounds = " and ".join(number(bound, 3) for bound in rows.drop_duplicates("tone")["bound"])
-    said = (
+    text = (
         f"{rows['data_sets'][0]} data sets. The Cramer-Rao bound is that of Gaussian noise of the same variance: "
         f"standard deviations of {bounds} rad/s. ± is one standard deviation of the Monte Carlo; valid: mean share of "
         "the 20 s, for whole records share of the data sets."
@@ -128,7 +128,7 @@ def efficiency_table(results: Results) -> Section:
     table.columns = [name if name.endswith("bound") else name.partition(": ")[2] for name in table]
     valid = rows.drop_duplicates("estimator").set_index("estimator")["valid_share"]
     table = table.assign(**{"valid [%]": valid}).rename(index=named).reset_index()
-    return Section("Beyond the paper: errors after 20 s of the noise of section VI-B", [said], table, FORMATS)
+    return Section("Beyond the paper: errors after 20 s of the noise of section VI-B", [text], table, FORMATS)
 
 
 def _pairs(rows: pd.DataFrame, name: str, digits: int, of_error: int) -> pd.Series:

@@ -127,7 +127,7 @@ def test_a_stored_fit_is_read_back_with_its_records(tmp_path):
 def test_inputs_that_differ_in_their_hold_share_a_finer_clock():
     record = record_of(FIRST, SECOND)
     smooth = HeldSignal(T, np.sin(T), "band-limited")
-    mixed = record.driven_by(u2=smooth)
+    mixed = replace(record, inputs={**record.held, "u2": smooth})
     y = simulate(FIRST, record.held["u1"], T) + simulate(SECOND, smooth, T)
     fit = DelayProfile(2, 0, (0.0, 2.0), inputs=OWN).fit(replace(mixed, y=y))
     assert fit.model.parts["u2"].delay == pytest.approx(SECOND.delay, abs=1e-3)
@@ -145,7 +145,7 @@ def test_records_and_inputs_that_do_not_go_together_are_refused(options, second,
     record = record_of(FIRST, SECOND)
     u1 = record.held["u1"].values
     changed = {"collinear": 3.0 - 2.0 * u1, "constant": np.ones(T.size)}.get(second or "")
-    record = record if changed is None else record.driven_by(u2=HeldSignal(T, changed))
+    record = record if changed is None else replace(record, inputs={**record.held, "u2": HeldSignal(T, changed)})
     with pytest.raises((DataError, OptionError), match=message):
         DelayProfile(1, 0, (0.0, 2.0), **options).fit(record)
 

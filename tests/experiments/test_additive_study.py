@@ -38,7 +38,7 @@ def test_the_open_loop_system_has_the_printed_poles(file):
         assert sorted(submodel.poles, key=np.imag) == pytest.approx([pole.conjugate(), pole], rel=1e-12)
         assert submodel.dc_gain == gain
         assert submodel.numerator.size == 1
-    assert source.noise.variance_of() == pytest.approx(0.02 * (1 + 1.35**2 / (1 - 0.85**2)))
+    assert source.noise.autocovariance([0])[0] == pytest.approx(0.02 * (1 + 1.35**2 / (1 - 0.85**2)))
     assert (source.sampling.interval, source.excitation.standard_deviation) == (0.05, 1.0)
 
 
@@ -52,7 +52,7 @@ def test_the_loop_is_the_printed_one(file):
     assert gain == pytest.approx(0.0115 + 0.00725 * z / (z - 1) + 0.00454 * (z - 1) / z)
     assert source.loop.enters == "controller"
     assert source.loop.reference.standard_deviation == 1.0
-    assert source.noise.variance_of() == pytest.approx(0.01)
+    assert source.noise.autocovariance([0])[0] == pytest.approx(0.01)
     assert source.sampling.interval == 0.05
 
 

@@ -9,8 +9,7 @@ from scipy import signal
 from ctid_cli import DataError, Flag
 from ctid_cli.custom_code import STUDIES, find_class
 from ctid_cli.reporting.study import find_study
-from ctid_cli.specification.load import spec_from_canonical
-from tests.frequency.signals import INTERVAL, NO_TWO_TONES, NOISE, OMEGA, T, tones
+from tests.frequency.signals import INTERVAL, NO_TWO_TONES, OMEGA, T, tones
 
 STUDY = find_study("finite-time-frequency")
 COMPARATORS = STUDIES / "finite_time_frequency" / "comparators"
@@ -81,21 +80,6 @@ def test_the_observer_has_the_poles_that_were_asked_for(n):
     assert np.poly(matrix) == pytest.approx(np.poly(-poles), rel=1e-8)
 
 
-def test_sensitivities_are_derivatives_of_the_observer():
-    rng = np.random.default_rng(0)
-    squares, gains = OMEGA[2] ** 2, rng.standard_normal(4)
-    states = rng.standard_normal((3, 4))
-    slope, plus, minus = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
-    observer.observer_slope(states, 0.7, squares, gains, slope)
-    for p in range(2):
-        # d/dt of the sensitivity is the change of the slope along (sensitivity, unit change of the square).
-        for sign, out in ((1, plus), (-1, minus)):
-            moved = states.copy()
-            moved[0] += sign * 1e-6 * states[p + 1]
-            observer.observer_slope(moved, 0.7, squares + sign * 1e-6 * np.eye(2)[p], gains, out)
-        np.testing.assert_allclose(slope[p + 1], (plus[0] - minus[0]) / 2e-6, atol=1e-8)
-
-
 @pytest.mark.parametrize("n", [1, 2])
 def test_the_observer_converges_from_nearby(n):
     track = Observer(tones=n, initial_frequencies=tuple(OMEGA[n] + 0.3)).track(tones(n, 9000).sum(axis=1), INTERVAL)
@@ -121,32 +105,12 @@ def test_whole_records_are_exact_without_noise(n):
         assert track.valid.all()
 
 
-def test_step_and_error_are_those_of_the_whole_jacobian():
-    # Against all unknowns at once: amplitudes and frequencies in one matrix.
-    t, omega = whole.centred_times(400, INTERVAL), OMEGA[2] * 1.01
-    y = tones(2, 400).sum(axis=1) + 0.1 * NOISE[:400]
-    step, error, cost = whole.frequency_step(y, t, omega)
-    angles = np.outer(t, omega)
-    linear = np.column_stack([np.sin(angles), np.cos(angles)])
-    a = np.linalg.lstsq(linear, y, rcond=None)[0]
-    J = np.column_stack([t[:, None] * (np.cos(angles) * a[:2] - np.sin(angles) * a[2:]), linear])
-    residual = y - linear @ a
-    np.testing.assert_allclose(step, np.linalg.lstsq(J, residual, rcond=None)[0][:2], rtol=1e-8)
-    np.testing.assert_allclose(error, np.sqrt(np.diag(np.linalg.inv(J.T @ J))[:2] * cost), rtol=1e-8)
-
-
 @pytest.mark.parametrize("name", ["zero", "constant", "one tone", "one tone and noise", "noise", "three tones"])
 @pytest.mark.parametrize(
     "options", [Filter(tones=2, pole=4.0), Esprit(tones=2, averaging=0.05)], ids=["filter", "whole"]
 )
 def test_no_estimate_is_valid_where_there_are_no_two_tones(options, name):
     assert not options.track(NO_TWO_TONES[name], INTERVAL).valid.any()
-
-
-def test_too_few_iterations_are_reported(monkeypatch):
-    monkeypatch.setattr(whole, "MOST_STEPS", 0)
-    track = Nonlinear(tones=2).track(tones(2, 1500).sum(axis=1) + 0.1 * NOISE[:1500], INTERVAL)
-    assert track.flags[0] & Flag.NOT_CONVERGED
 
 
 @pytest.mark.parametrize(
@@ -179,16 +143,3 @@ def test_impossible_options_are_refused(kind, options, field):
 def test_records_that_do_not_fit_are_refused_before_there_are_any(options, count, interval, message):
     with pytest.raises(DataError, match=message):
         options.check(count, interval)
-
-
-def test_a_missing_sample_is_refused():
-    with pytest.raises(DataError, match="takes no missing ones"):
-        Esprit(tones=2).track(np.append(np.ones(500), np.nan), INTERVAL)
-
-
-def test_a_step_within_a_whole_record_is_unwise():
-    spec = STUDY.plan(
-        "two-tones", ["signal.tones=[{frequency: [{until: 30, value: 2}, {value: 2.1}]}, {frequency: 3}]"]
-    ).spec
-    assert sum("gives one estimate of the whole record" in warning for warning in spec.warnings) == 2
-    assert spec_from_canonical(spec.canonical(), spec.folder).canonical() == spec.canonical()

@@ -128,24 +128,6 @@ def test_gains_of_any_size_are_stable():
         assert np.isfinite(track.frequencies).all()
 
 
-def test_a_literal_power_is_the_number_of_tones():
-    y = noisy(2)
-    literal, once = ({"epsilon": 0.5, "power": "literal"}, {"epsilon": 0.25})
-    tracks = [DremFiniteTime(tones=2, h=H, d=D, **options).track(y, INTERVAL) for options in (literal, once)]
-    assert np.array_equal(tracks[0].frequencies, tracks[1].frequencies)
-
-
-def test_amplitude_is_a_gain_and_time_is_relative():
-    y = noisy(2)
-    base = DremFiniteTime(tones=2, h=H, d=D, gamma=1.0, first_row=0).track(y, INTERVAL)
-    louder = DremFiniteTime(tones=2, h=H, d=D, gamma=10.0**-12, first_row=0).track(1000.0 * y, INTERVAL)
-    np.testing.assert_allclose(louder.frequencies, base.frequencies, atol=1e-9)
-    assert np.array_equal(louder.flags, base.flags)
-    slower = DremFiniteTime(tones=2, h=8 * H, d=8 * D, gamma=0.125, first_row=0).track(y, 8 * INTERVAL)
-    np.testing.assert_allclose(8.0 * slower.frequencies, base.frequencies, rtol=1e-12)
-    assert np.array_equal(slower.flags, base.flags)
-
-
 def test_zero_filled_delays_enter_the_estimate():
     y = tones(2, 3000).sum(axis=1)
     gated = DremFiniteTime(tones=2, h=H, d=D).track(y, INTERVAL)

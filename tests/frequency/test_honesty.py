@@ -81,14 +81,6 @@ def test_an_estimate_that_converges_stays_valid(options):
     assert np.abs(track.frequencies[track.valid] - TRUTH).max() < 1e-3
 
 
-def test_tones_that_look_alike_at_the_delay_are_one():
-    # cos(w h) is equal for 2 and 2 pi/0.7 - 2 rad/s; at another delay they differ.
-    y = np.sin(2 * T) + np.sin((2 * np.pi / 0.7 - 2) * T)
-    assert not RestartingLeastSquares(tones=2, h=0.7).track(y, INTERVAL).valid.any()
-    track = RestartingLeastSquares(tones=2, h=0.4).track(y, INTERVAL)
-    assert track.valid[-1000:].all()
-
-
 def test_five_tones_are_valid_only_once_they_are_known():
     omega = np.array([1.0, 2.0, 3.0, 4.2, 5.5])
     y = np.sin(np.outer(T, omega) + np.arange(5)).sum(axis=1)

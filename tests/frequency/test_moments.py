@@ -53,10 +53,6 @@ def test_second_delay_is_shorter_and_shares_no_divisor(lag):
     assert abs(second - 0.618 * lag) <= max(4.0, 0.01 * lag)
 
 
-def test_at_the_shortest_delay_nothing_can_alias():
-    assert second_lag(1) == 1
-
-
 def second_moments(y, n, lag):
     psi, phi = regression_rows(y, n, lag)
     rows = np.column_stack([phi, psi])
@@ -83,15 +79,3 @@ def test_every_alias_is_told_from_the_frequency_itself(n, noise):
                 > (0.1 if noise else 0.0) + 10 * noise
             ):
                 assert flag_inconsistent(gram, aliased, second * interval, 1e-8) == Flag.INCONSISTENT
-
-
-def test_negligible_residuals_are_none():
-    # With frequency errors of 1e-5 less than 1e-8 of the regressand's square remains, and least squares leaves nothing.
-    omega, second = np.array([1.0, 2.0]), second_lag(50)
-    gram = second_moments(tones(2, 4000, 0.01, omega).sum(axis=1), 2, second)
-    assert flag_inconsistent(gram, omega * (1 + 1e-5), second * 0.01, 1e-8) == 0
-    assert flag_inconsistent(gram, omega * (1 + 1e-5), second * 0.01, 1e-14) == Flag.INCONSISTENT
-
-
-def test_consistency_needs_data():
-    assert flag_inconsistent(np.zeros((3, 3)), np.array([1.0, 2.0]), 0.1, 1e-8) == 0

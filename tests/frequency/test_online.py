@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.frequency import delay_regression
 from ctid_cli.frequency.drem import DremFiniteTime, DremWindow
-from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from tests.frequency.signals import INTERVAL, OMEGA, online_estimators, tones
 
@@ -44,21 +42,6 @@ def test_samples_one_by_one_give_the_numbers_of_the_record(options):
     assert (np.nanstd(track.frequencies[1000:], axis=0) > 0).all()
 
 
-@each
-def test_blocks_of_any_length_give_the_same_numbers(options, monkeypatch):
-    y = eventful()
-    whole = options.track(y, INTERVAL)
-    monkeypatch.setattr(delay_regression, "BLOCK", 37)
-    same(options.track(y, INTERVAL), whole)
-
-
-@each
-def test_no_samples_are_no_estimates(options):
-    track = options.track(np.empty(0), INTERVAL)
-    assert track.frequencies.shape == (0, 2)
-    assert track.flags.shape == track.valid.shape == track.t.shape == (0,)
-
-
 @pytest.mark.parametrize("samples", [np.zeros((5, 2)), np.zeros(5, complex), np.array(["a"]), 3.0])
 def test_what_is_no_series_of_numbers_is_refused(samples):
     with pytest.raises(DataError, match="one series of real numbers"):
@@ -70,15 +53,6 @@ def test_what_is_no_series_of_numbers_is_refused(samples):
 def test_impossible_intervals_are_refused(options, interval):
     with pytest.raises(ValueError, match="interval must be a positive number"):
         options.start(interval)
-
-
-def test_estimates_explain_themselves():
-    online = RestartingLeastSquares(tones=2, h=0.4).start(INTERVAL)
-    estimate = online.update(1.0)
-    assert not estimate.valid[0]
-    assert estimate.flags[0] == Flag.STARTING
-    assert estimate.reasons(0) == ("Too few samples have arrived since the start or since the last restart.",)
-    assert online.update(1.0).t[0] == INTERVAL
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.polynomial import polynomial
 
-from ctid_cli.frequency.delay_regression import delay_table, theta_of, whole_delay
+from ctid_cli.frequency.delay_regression import delay_table, theta_of
 from ctid_cli.frequency.drem import mix
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from tests.frequency.signals import AMPLITUDES, OMEGA, regression_rows, tones
@@ -67,8 +67,3 @@ def test_mixing_of_a_singular_matrix_is_finite():
     right, delta = mixed(np.array([[1.0, 2.0, 3.0], [1.0, 2.0, 5.0]]))
     assert delta == 0.0
     np.testing.assert_array_equal(right, [-4.0, 2.0])
-
-
-@pytest.mark.parametrize(("delay", "interval", "count"), [(0.1, 0.001, 100), (0.1, 0.003, 33), (0.006, 0.01, 1)])
-def test_delays_are_whole_intervals(delay, interval, count):
-    assert whole_delay("h", delay, interval) == count

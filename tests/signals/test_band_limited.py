@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from ctid_cli import DataError, HeldSignal, Record, TransferFunction, estimate_frequency_response, simulate
-from ctid_cli.filtering.filter_data import filter_data, used_samples
-from ctid_cli.filtering.spectra import record_spectra
+from ctid_cli import HeldSignal, TransferFunction, simulate
 from ctid_cli.signals.band_limited import FINER, REACH, band_limited_doubt
 
 INTERVAL, PERIOD = 0.2, 400
@@ -88,43 +86,3 @@ def test_what_is_not_known_at_the_ends():
     doubt = band_limited_doubt(t, values)
     assert doubt.reach == pytest.approx(REACH * INTERVAL)
     assert 0.2 < doubt.ends / np.sqrt(np.mean(off**2)) < 5
-
-
-def test_passes_see_the_samples_of_the_record():
-    t = INTERVAL * np.arange(100)
-    y = np.cos(t)
-    y[7] = np.nan
-    record = Record(t, y, HeldSignal(t, np.sin(t), "band-limited"))
-    for periodic in (False, True):
-        data = filter_data(record, 2.0, periodic=periodic)
-        assert data.interval == pytest.approx(INTERVAL / FINER)
-        used = used_samples(data, record)
-        assert used.tolist() == (record.valid & (t >= 2.0 - 1e-9)).tolist()
-        assert data.y_used.tolist() == y[used].tolist()
-
-
-def test_spectra_of_the_input():
-    w, phases = period(0.5)
-    t = INTERVAL * np.arange(3 * PERIOD + 1)
-    u = waves(t, w, phases)
-    record = Record(t, u, HeldSignal(t, u, "band-limited"))
-    found = record_spectra(record, PERIOD * INTERVAL, np.pi / INTERVAL, 1.0).inputs(0.45)
-    # Two periods: every other line is excited, with half the amplitude of a cosine.
-    lines = np.rint(w * 2 * PERIOD * INTERVAL / (2 * np.pi)).astype(int)
-    assert found[lines] == pytest.approx(0.5 * np.exp(1j * (phases - 0.45 * w)), abs=2e-3)
-
-
-def test_the_frequency_response_of_a_band_limited_record_is_exact():
-    model = MODELS["resonant"]
-    w, phases = period(0.9)
-    t = INTERVAL * np.arange(3 * PERIOD)
-    u, y = waves(t, w, phases), waves(t, w, phases, exact(model, w))
-    found = estimate_frequency_response(Record(t, y, HeldSignal(t, u, "band-limited")))
-    assert found.frequencies == pytest.approx(w, rel=1e-9)
-    assert np.abs(found.response - exact(model, w)).max() < 1e-10 * np.abs(exact(model, w)).max()
-    assert not found.bias.any()
-
-
-def test_an_irregular_clock_is_refused():
-    with pytest.raises(DataError, match="needs a regular clock"):
-        HeldSignal([0.0, 1.0, 2.5], [1.0, 2.0, 3.0], "band-limited")

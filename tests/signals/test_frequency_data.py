@@ -51,10 +51,10 @@ def test_units_errors_samples_and_lines_without_a_value(tmp_path):
 @pytest.mark.parametrize(
     ("header", "comment", "message"),
     [
-        ("frequency,real,imaginary", "", "must say its unit"),
-        ("frequency [rad/s],gain,phase", "", "phase' must say its unit"),
+        ("frequency,real,imaginary", "", "frequency' must have a unit"),
+        ("frequency [rad/s],gain,phase", "", "phase' must have a unit"),
         ("frequency [rad/s],real,b", "", "no column 'gain'"),
-        ("frequency [rad/s],real,imaginary", "# hold: foh\n", "1: hold must be zoh and none, not 'foh'"),
+        ("frequency [rad/s],real,imaginary", "# hold: foh\n", "1: hold must be zoh or none, not 'foh'"),
         ("frequency [rad/s],real,imaginary", "# hold: zoh\n", "1: hold zoh needs the sampling interval"),
         ("frequency [rad/s],real,imaginary", "# interval: 1\n", "1: an interval needs the hold"),
         (

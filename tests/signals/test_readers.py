@@ -19,20 +19,12 @@ COMMAS = "t{0}u{0}y\n0{0}1{0}0,25\n0,5{0}-1,5{0}\n1{0}2{0}3\n"
 #: Kind: content, notes.
 READ = {
     "commas": (POINTS.format(","), ()),
-    "semicolons, decimal points": (POINTS.format(";"), ()),
     "semicolons, decimal commas": (COMMAS.format(";"), (COMMA,)),
-    "tabs, decimal points": (POINTS.format("\t"), ()),
     "tabs, decimal commas": (COMMAS.format("\t"), (COMMA,)),
     "blanks": ("t u y\n0  1  0.25\n0.5 -1.5 nan\n1\t2 3\n", ()),
-    "thousands of blanks": (
-        f"t{' ' * 3000}u y\n{' ' * 5000}0 1 0.25\n0.5 -1.5{' ' * 9000}nan\n1 2 3{' ' * 2000}\n",
-        (),
-    ),
-    "blanks, decimal commas": ("t u y\n0 1 0,25\n0,5 -1,5 nan\n1 2 3\n", (COMMA,)),
     "commas, quoted decimal commas": ('t,u,y\n"0","1","0,25"\n"0,5","-1,5",""\n"1","2","3"\n', (COMMA,)),
     "UTF-8 with its mark": (POINTS.format(",").encode("utf-8-sig"), ()),
     "UTF-16": (POINTS.format(",").encode("utf-16"), ()),
-    "UTF-32": (POINTS.format(",").encode("utf-32"), ()),
     "Windows-1252": ("t [s],u [°C],y\n0,1,.25\n0.5,-1.5,\n1,2,3".encode("cp1252"), (ANSI,)),
     "CRLF, no end of the last line": (POINTS.format(",").replace("\n", "\r\n").rstrip(), ()),
     "CR": (POINTS.format(",").replace("\n", "\r"), ()),
@@ -45,7 +37,6 @@ READ = {
     ),
     "comments above": ("# pump 3\n% 2 Hz\n\n" + POINTS.format(","), ()),
     "names in a comment": ("# pump 3\n# t u y\n0 1 0.25\n0.5 -1.5 nan\n1 2 3\n", ()),
-    "quoted fields": ('"t","u","y"\n"0","1","0.25"\n"0.5","-1.5",""\n"1","2","3"\n', ()),
     "separators at the ends": ("t,u,y,\n0,1,0.25,,\n0.5,-1.5,,,\n1,2,3,\n", ()),
     "blank lines": ("t,u,y\n0,1,0.25\n\n0.5,-1.5,NA\n,,\n1,2,3\n\n", ()),
     "last line cut": (
@@ -59,7 +50,8 @@ READ = {
 }
 
 TOGETHER = "which is a number with a decimal point, unlike the first 50 lines; write all with one decimal sign"
-THREE = "and nothing else; a record needs a time, an input and an output"
+NAMES = "The first line that is no comment must name the columns, separated by commas, semicolons, tabs or blanks"
+THREE = f"and nothing else; a record needs a time, an input and an output. {NAMES}"
 FOUR = "'t', 'a', 'b', 'c'"
 ONE = "; say which one (option time)"
 WHICH = ". Say which one is the input (option input)"
@@ -68,43 +60,43 @@ COMMAS_TWICE = "; numbers with decimal commas need another separator, such as th
 COMMENT = "which is a comment; move comments above the names of the columns, or delete them"
 QUOTE = "a quotation mark is opened and never closed; export the file anew, or correct the line"
 GAPS = "; only the output may have gaps"
-EMPTY = "; leave the field empty where a sample is missing"
+EMPTY = "; missing samples are NaN, or empty fields of a file"
 STRICTLY = "on line 3; times must increase strictly"
+INSTANT = "every sample needs its instant"
+NO_TEXT = "this is not a text file in UTF-8, or in UTF-16 with a byte order mark"
 KINDS = "records are read from text (.csv, .txt), MATLAB files (.mat) and HDF5 files (.h5)"
 DATE = "which is a date or a time of day; write times as numbers, such as seconds since the first sample"
+MARKS = "which is a number with separators between its digits; write it with digits and one decimal sign"
 NUMBER = "which is not a number; leave the field empty if the sample is missing"
-NO_NAMES = ":1: the first line holds numbers; it must name the columns, for example t,u,y"
+NO_NAMES = ":1: the first line names no columns; it must name them, for example t,u,y"
 HUGE = "give it in a unit in which it is between"
 #: Kind: content, the message after the file name.
 REFUSED = {
     "empty": ("", ":1: the file is empty; its first line must name the columns"),
-    "comments only": ("# t,u,y\n", ":1: the file is empty; its first line must name the columns"),
     "header only": ("t,u,y\n", ":2: the file has a header and no data"),
-    "header and blank lines": ("t;u;y\n;;\n\n", ":2: the file has a header and no data"),
     "no header": ("0,1,2\n1,1,2\n", NO_NAMES),
-    "nameless": (",,\n0,1,2\n", ":1: the line names no columns; it must name them, as in t,u,y"),
+    "nameless": (",,\n0,1,2\n", ":1: the first line names no columns; it must name them, for example t,u,y"),
     "one column": ("y\n0\n1\n", f":1: the file has 'y' {THREE}"),
-    "two columns": ("t u\n0 1\n", f":1: the file has 't', 'u' {THREE}"),
     "names twice": ("t,u,u,y\n0,1,2,3\n", ":1: 2 columns are called 'u'; rename all but one"),
     "two times": ("t [s],t (h),u,y\n0,1,2,3\n", f":1: 't [s]' and 't (h)' may all be the time{ONE}"),
     "unknown names": ("t,a,b,c\n0,1,2,3\n", f":1: no column is called 'u' or 'input'; the file has {FOUR}{WHICH}"),
     "word": ("t,u,y\n0,1,2\n\n1,one,2\n", f":4: column 'u' holds 'one', {NUMBER}"),
-    "thousands mark": ("t;u;y\n0;1;2\n1;1.000,5;2\n", f":3: column 'u' holds '1.000,5', {NUMBER}"),
+    "thousands mark": ("t;u;y\n0;1;2\n1;1.000,5;2\n", f":3: column 'u' holds '1.000,5', {MARKS}"),
     "other decimal sign": ("t;u;y\n0;1,5;2,5\n1;1.5;2\n", f":3: column 'u' holds '1.5', {TOGETHER}"),
     "decimal commas between commas": ("t,u,y\n0,0,1,5,2,5\n0,5,1,5,2,5\n", f":2: {SIX}{COMMAS_TWICE}"),
     "too many fields": ("t;u;y\n0;1;2\n1;1;2;7\n", ":3: the line has 4 fields where line 1 names 3"),
     "comment between": ("t,u,y\n0,1,2\n# pause\n1,1,2\n", f":3: column 't' holds '# pause', {COMMENT}"),
     "dates": ("t,u,y\n2024-03-01T12:00:00,1,2\n", f":2: column 't' holds '2024-03-01T12:00:00', {DATE}"),
-    "times of day": ("t,u,y\n12:00:01,1,2\n", f":2: column 't' holds '12:00:01', {DATE}"),
     "open quotation mark": ('t,u,y\n0,1,"2\n1,1,2\n', f":2: {QUOTE}"),
-    "time missing": ("t,u,y\n0,1,2\n,1,2\n", ":3: time 't' is missing or not finite; every line needs its instant [s]"),
+    "time missing": ("t,u,y\n0,1,2\n,1,2\n", f":3: time 't' is missing or not finite; {INSTANT} [s]"),
     "time repeated": ("t [ms],u,y\n0,1,2\n5,1,2\n5,1,2\n", f":4: time 't [ms]' repeats 5 ms after 5 ms {STRICTLY}"),
     "time going back": ("t,u,y\n0,1,2\n1,1,2\n\n0.5,1,2\n", f":5: time 't' goes back to 0.5 s after 1 s {STRICTLY}"),
     "input missing": ("t,u,y\n0,1,2\n1,nan,2\n", f":3: input 'u' is missing or not finite{GAPS}"),
     "output infinite": ("t,u,y\n0,1,2\n1,1,-inf\n", f":3: output 'y' is infinite{EMPTY}"),
-    "no output": ("t,u,y\n0,1,\n1,1,nan\n", ":2: no sample of the output 'y' is a finite number"),
+    "no output": ("t,u,y\n0,1,\n1,1,nan\n", ":2: no sample of output 'y' is a finite number"),
     "huge numbers": ("t,u,y\n0,1,2\n1,1e300,2\n", f":3: input 'u' reaches 1e+300; {HUGE} 1e-60 and 1e+60"),
-    "no text": (b"\x89PNG\r\n\x1a\n\x00\x00", f": this is not a text file; {KINDS}"),
+    "no text": (
+        b"\x89PNG\r\n\x1a\n\x00\x00", f": {NO_TEXT}; {KINDS}"),
 }  # fmt: skip
 
 
@@ -133,13 +125,6 @@ def test_a_word_and_a_field_too_many_are_found_far_down(write):
     for row, message in (("190000,1,off", "column 'y' holds 'off'"), ("190000,1,2,5", "the line has 4 fields")):
         with pytest.raises(DataError, match=rf":190002: {message}"):
             read_record(write("\n".join(["t,u,y", *rows[:190_000], row, *rows[190_001:]])))
-
-
-def test_first_lines_that_name_no_columns(write):
-    wide = ",".join(f"x{k}" for k in range(10_001))
-    for header, message in ((wide, "names 10001 columns; at most 10000"), ("x" * 2_000_000, "more than 1000000 bytes")):
-        with pytest.raises(DataError, match=rf":1: the line .*{message}"):
-            read_measurement(write(header + "\n0,1\n"))
 
 
 @given(st.lists(st.tuples(st.floats(-1e9, 1e9), st.floats(-1e59, 1e59) | st.just(float("nan"))), min_size=1))

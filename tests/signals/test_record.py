@@ -17,15 +17,6 @@ class Proportional:
     denominator = (1.0,)
 
 
-def test_masked_samples_are_counted_and_marked():
-    record = Record([0.0, 1.0, 2.5], [1.0, np.nan, 3.0], ONE)
-    assert record.n_samples == 3
-    assert record.duration == 2.5
-    assert record.valid.tolist() == [True, False, True]
-    assert record.interval is None
-    assert Record([0.0], [1.0], ONE).interval is None
-
-
 def test_input_is_on_the_grid_only_if_every_break_is():
     t = 0.1 * np.arange(10)
     u = np.arange(10.0)
@@ -55,14 +46,14 @@ def test_a_record_is_what_it_was_made_of_and_never_changes():
     [
         ([], [], "pump: the record is empty"),
         ([0.0, 1.0], [1.0], "pump: times and outputs must be one-dimensional and of equal length"),
-        ([0.0, np.nan], [1.0, 2.0], "pump: time of sample 1 is not a finite number"),
+        ([0.0, np.nan], [1.0, 2.0], "pump: sample 2: the time is missing or not finite"),
         (
             [0.0, 1.0, 1.0],
             [1.0, 2.0, 3.0],
-            "pump: times must increase strictly; samples 1 and 2 are at 1 and 1 s",
+            "pump: sample 3: the time repeats 1 s after 1 s on sample 2; times must increase strictly",
         ),
-        ([0.0, 1.0], [1.0, np.inf], "pump: output of sample 1 is infinite"),
-        ([0.0, 1.0], [np.nan, np.nan], "pump: no output sample is a finite number"),
+        ([0.0, 1.0], [1.0, np.inf], "pump: sample 2: the output is infinite"),
+        ([0.0, 1.0], [np.nan, np.nan], "pump: sample 1: no sample of the output is a finite number"),
     ],
 )
 def test_unusable_records_are_refused(t, y, message):
@@ -96,9 +87,3 @@ def in_loop(t=T, u=T, hold="zoh", reference=(1.0, 2.0, 3.0, 4.0, 5.0), **more):
 def test_impossible_loops_are_refused(options, message):
     with pytest.raises(DataError, match=message):
         in_loop(**options)
-
-
-def test_a_reference_enters_in_one_of_two_places():
-    assert in_loop().loop.enters == "controller"
-    with pytest.raises(ValueError, match="enters must be 'controller' or 'input', not 'output'"):
-        in_loop(enters="output")

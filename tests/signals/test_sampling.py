@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.stats import kstest
 
 from ctid_cli.errors import DataError
@@ -15,7 +13,6 @@ from ctid_cli.signals.sampling import (
     JitteredSampling,
     RegularSampling,
     UniformIntervals,
-    geometric_sizes,
 )
 
 #: Significance level of the tests of distributions; the seeds are fixed.
@@ -78,23 +75,3 @@ def test_instants_come_from_a_column_of_a_file(tmp_path):
     file.write_text("t\n0\n")
     with pytest.raises(DataError, match="there is one instant"):
         InstantsFile(str(file)).times(None)
-
-
-@given(st.integers(50, 1000), st.floats(1.5, 300), st.integers(2, 30))
-def test_geometric_sizes(first, ratio, count):
-    last = round(first * ratio)
-    sizes = geometric_sizes(first, last, count)
-    assert (sizes[0], sizes[-1], len(sizes)) == (first, last, count)
-    for k, size in enumerate(sizes):
-        assert abs(size - first * (last / first) ** (k / (count - 1))) <= 0.5 + 1e-9 * size
-
-
-@pytest.mark.parametrize(
-    ("first", "last", "count", "unrounded", "rounded"),
-    [(2000, 100_000, 30, 778_580, 778_581), (500, 123_036, 50, 1_153_484, 1_153_482)],
-)
-def test_sizes_of_the_published_studies_of_additive_models(first, last, count, unrounded, rounded):
-    # The totals printed by González, Classens, Rojas, Welsh and Oomen are those of the sizes before rounding.
-    exact = [first * (last / first) ** (k / (count - 1)) for k in range(count)]
-    assert round(sum(exact)) == unrounded
-    assert sum(geometric_sizes(first, last, count)) == rounded

@@ -4,7 +4,7 @@ import pytest
 
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.running.plan import build_plan
-from ctid_cli.signals.sampling import geometric_sizes
+from ctid_cli.specification.sections import geometric_sizes
 from tests.specification.written import CLOSED_LOOP as CLOSED
 from tests.specification.written import changed, load
 
@@ -92,3 +92,14 @@ def test_starts_and_estimators_of_both_kinds(tmp_path):
     assert [(cell.name, start.label) for _, cell, start in plan.keys(0, 0)] == [
         ("both", "none"), ("one", "none"), ("search", "0.1"),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "count", "unrounded", "rounded"),
+    [(2000, 100_000, 30, 778_580, 778_581), (500, 123_036, 50, 1_153_484, 1_153_482)],
+)
+def test_sizes_of_the_published_studies_of_additive_models(first, last, count, unrounded, rounded):
+    # The totals printed by González, Classens, Rojas, Welsh and Oomen are those of the sizes before rounding.
+    exact = [first * (last / first) ** (k / (count - 1)) for k in range(count)]
+    assert round(sum(exact)) == unrounded
+    assert sum(geometric_sizes(first, last, count)) == rounded
