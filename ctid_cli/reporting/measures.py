@@ -37,9 +37,8 @@ from ctid_cli.running.theory import least_variances
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name
 from ctid_cli.storage.columns import COUNTS, OF_MEASURES, reserved_names
 from ctid_cli.storage.estimates import CLOCKS
-from ctid_cli.storage.groups import places_of
+from ctid_cli.storage.estimation_errors import distances, places_of, pole_errors, system_of
 from ctid_cli.storage.manifest import is_of_signal, true_values
-from ctid_cli.storage.model_errors import distances, pole_errors, system_of
 from ctid_cli.storage.truth import coefficients_of
 from ctid_cli.text import did_you_mean, listed
 
