@@ -77,7 +77,7 @@ class StatusResult(Result):
             notes = [f"{status}: {message}" for status, message in messages if message]
             sections += [Section(frame=found[["status", "estimates"]], notes=notes), *self._failed()]
         if status.left_aside:
-            aside = f"{status.left_aside} stored estimates are set aside: the latest run asked for others."
+            aside = f"{status.left_aside} stored estimates are set aside: the latest run has other settings."
             aside += " To see them, run their specification again; nothing is computed anew."
             sections.append(Section(sentences=[aside]))
         return [*sections, Section(sentences=self._next())]
@@ -185,9 +185,10 @@ def precision_frame(cells: Sequence[CellPrecision]) -> pd.DataFrame:
     """Return every data cell with its widest interval."""
     rows = []
     for cell in cells:
-        widest = (_measure(cell.widest), _width(cell.widest), _asked(cell.widest)) if cell.widest else ("-", "-", "-")
+        one = cell.widest
+        widest = (_measure(one), _width(one), _required(one)) if one else ("-", "-", "-")
         counts = {"data sets": cell.finished, "needed": cell.needed}
-        shown = dict(zip(("widest interval", "half-width", "asked"), widest, strict=True))
+        shown = dict(zip(("widest interval", "half-width", "required"), widest, strict=True))
         rows.append({**cell.swept, **counts, **shown, "": _STATES[cell.state]})
     return pd.DataFrame(rows)
 
@@ -207,7 +208,7 @@ def precision_sentence(cells: Sequence[CellPrecision]) -> str:
         ended = f"{missed} of {len(cells)} data cells ended at {max(sizes)} data sets with wider intervals"
         return f"{ended}, which ctid status lists"
     several = " to ".join(dict.fromkeys((str(min(sizes)), str(max(sizes)))))
-    return f"{several} data sets in each data cell: all intervals are as narrow as asked for"
+    return f"{several} data sets in each data cell: all intervals are as narrow as requested"
 
 
 def _measure(widest: Widest) -> str:
@@ -221,7 +222,7 @@ def _width(widest: Widest) -> str:
     return "not known" if widest.half_width is None else _with_unit(widest.half_width, widest)
 
 
-def _asked(widest: Widest) -> str:
+def _required(widest: Widest) -> str:
     return _with_unit(widest.asked, widest)
 
 
@@ -268,7 +269,7 @@ class MergeResult(Result):
         merged = self.merged
         head = f"{merged.experiment}: {merged.stored} of {merged.planned} estimates in {merged.folder}"
         lines = [f"{head} ({merged.new} new, from {merged.sources} folders)"]
-        lines += [f"  they {MIXED.replace('mixes', 'mix')}, which tables will say"] if merged.mixed else []
+        lines += [f"  they {MIXED.replace('mixes', 'mix')}, which tables note"] if merged.mixed else []
         lines += [f"  {merged.missing}"] if merged.missing else []
         lines.append(f"  next: ctid table {merged.experiment}{out_option(self.out)}")
         return [Section(lines=lines)]

@@ -96,8 +96,8 @@ class Found:
     """Result of a trial."""
 
     #: Errors to correct, and problems that may not occur with other data.
-    wrong: list[Complaint] = field(default_factory=list)
-    odd: list[Complaint] = field(default_factory=list)
+    errors: list[Complaint] = field(default_factory=list)
+    warnings: list[Complaint] = field(default_factory=list)
 
 
 def try_out(spec: Spec) -> Found:
@@ -188,7 +188,7 @@ def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], succe
                 if first and not unusable and (candidate.is_custom or setting.cell.measures):
                     _fit(candidate, data, setting, [one.estimator for one in candidates], success, found)
     for subject, some in failures.items():
-        found.wrong.extend(grouped(some, tried[subject]))
+        found.errors.extend(grouped(some, tried[subject]))
     return found
 
 
@@ -272,23 +272,23 @@ def _fit(
     try:
         (first, values, reasons), (second, others, _) = _twice(fit)
         text = f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options"
-        found.wrong.extend((("measures", name), text) for name in values if values[name] != others[name])
+        found.errors.extend((("measures", name), text) for name in values if values[name] != others[name])
         if canonical_json(first) != canonical_json(second):
             raise ComponentError(text)
     except ComponentError as error:
-        found.wrong.append((path, str(error)))
+        found.errors.append((path, str(error)))
     except MISTAKES as error:
-        found.wrong.append((path, f"fails on the first data set: {reason(error)}"))
+        found.errors.append((path, f"fails on the first data set: {reason(error)}"))
     except BaseException as error:
         # Other data sets may not have such a failure.
         text = f"fails on the first data set: {reason(error)}; such estimates are stored as FAILED"
-        found.odd.append((path, text))
+        found.warnings.append((path, text))
     else:
         for name, why in reasons.items():
             text = f"fails on the first data set, with the estimator {candidate.name!r}: {why}"
-            found.odd.append((("measures", name), f"{text}; such estimates are stored without it"))
+            found.warnings.append((("measures", name), f"{text}; such estimates are stored without it"))
         if first["status"] not in FAILURES and candidate.is_custom:
-            found.odd.extend(
+            found.warnings.extend(
                 (path, text) for text in _uncounted(first, true_values({"content": cell.content}), success)
             )
 
@@ -300,8 +300,8 @@ def _uncounted(row: Mapping[str, Any], truth: Mapping[str, float], success: Mapp
         names = ", ".join(row["parameters"] or {}) or "a model with another number of poles"
         yield f"returns {names}; true values are known of {', '.join(truth)} only"
     delays = [name for name in truth if is_delay(name)]
-    asked = {"delay_relative_error": delays, "parameter_relative_error": [n for n in truth if n not in delays]}
-    for rule, wanted in asked.items():
+    rules = {"delay_relative_error": delays, "parameter_relative_error": [n for n in truth if n not in delays]}
+    for rule, wanted in rules.items():
         lacking = [each for each in wanted if lacks[each]]
         if lacking and success.get(rule) is not None:
             yield f"returns no {', '.join(lacking)}, so that it never meets success.{rule}"

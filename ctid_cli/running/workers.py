@@ -280,7 +280,7 @@ class LocalWorkers:
     def __init__(self, count: int, limits: Limits) -> None:
         self.count, self._limits = count, limits
         #: Why the last workers ended early.
-        self.trouble = ""
+        self.ended_by = ""
         self._made = TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True)
         self._folder = Path(self._made.name)
         self._numbers = itertools.count()
@@ -295,7 +295,7 @@ class LocalWorkers:
         """
         stop = self._folder / _STOP
         stop.unlink(missing_ok=True)
-        self.trouble = ""
+        self.ended_by = ""
 
         def submit(*call: Any) -> Future[Ending]:
             try:
@@ -309,13 +309,13 @@ class LocalWorkers:
         def died(job: Job, error: Exception) -> Ending:
             if not isinstance(error, BrokenExecutor | OSError | MemoryError):
                 raise error
-            self.trouble = str(error).strip().partition("\n")[0] or type(error).__name__
-            return _remains(self._at_work[job][0], self.trouble)
+            self.ended_by = str(error).strip().partition("\n")[0] or type(error).__name__
+            return _remains(self._at_work[job][0], self.ended_by)
 
         def at_once() -> int:
             if stopping():
                 stop.touch()
-            return 0 if self.trouble else self.count + 1
+            return 0 if self.ended_by else self.count + 1
 
         yield from self._computed(jobs, compute_unless_stopped, submit, at_once, died, stopping)
 

@@ -62,7 +62,7 @@ def joint_complaints(
     spec: Spec, broken: frozenset[str], trial: Callable[[Spec], Iterable[Complaint]], *, files_are_good: bool
 ) -> list[Complaint]:
     """Return the contradictions between sections of a specification, and the problems found by a trial."""
-    found = [*_of_names(spec), *_of_missing(spec, broken), *_of_worlds(spec, broken)]
+    found = [*_of_names(spec), *_of_missing(spec, broken), *_of_kinds(spec, broken)]
     cases = cases_of(spec, files_are_good=files_are_good)
     too_long = list(sweeps.checked(cases, (_of_length,)))
     usable = {name: given for name, given in cases.items() if not too_long or name not in ("sampling", "duration")}
@@ -194,8 +194,8 @@ def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
         give = "give loop, or data.reference and loop.controller for a measured record"
         message = f"closed-loop instruments need the reference and the controller; {give}"
         for name, section in spec.estimators.items():
-            asked = [] if section.custom else np.atleast_1d(getattr(section, "instruments", "open_loop")).tolist()
-            if "closed_loop" in asked:
+            instruments = [] if section.custom else np.atleast_1d(getattr(section, "instruments", "open_loop")).tolist()
+            if "closed_loop" in instruments:
                 yield ("estimators", name, "instruments"), message
     if spec.data is None and not _is_regular(spec):
         if spec.signal is not None:
@@ -204,7 +204,7 @@ def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
             yield ("sampling", "kind"), "must be regular in a loop: the controller is discrete and acts at every sample"
 
 
-def _of_worlds(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
+def _of_kinds(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
     """Yield estimators and success rules that belong to the other kind of experiment."""
     on_signal = spec.signal is not None
     if not on_signal and ("signal" in broken or (spec.system is None and spec.data is None)):

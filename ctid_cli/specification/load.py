@@ -51,16 +51,17 @@ def load_spec(
     if too_many := too_many_cases(spec):
         raise SpecError([source.problem((), too_many)])
     spec, about_files = _with_files(spec, own=isinstance(given, Mapping), anywhere=allow_outside)
-    odd: list[Complaint] = []
+    from_trial: list[Complaint] = []
 
     def tried(part: Spec) -> Sequence[Complaint]:
         found = trial(part) if trial is not None else None
-        odd.extend(found.odd if found is not None else ())
-        return found.wrong if found is not None else ()
+        from_trial.extend(found.warnings if found is not None else ())
+        return found.errors if found is not None else ()
 
     joint = joint_complaints(spec, broken, tried, files_are_good=not about_files)
     _require_none(source, [*complaints, *about_files, *joint])
-    spec._warnings = tuple(str(source.problem(where, message)) for where, message in (*joint_warnings(spec), *odd))
+    warnings = [*joint_warnings(spec), *from_trial]
+    spec._warnings = tuple(str(source.problem(where, message)) for where, message in warnings)
     return spec
 
 

@@ -64,7 +64,7 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Complaint
     parts = [str(part) for part in error["loc"]]
     path = tuple(part for part in error["loc"] if not str(part).startswith(TAG))
     kind, value, context = error["type"], error["input"], error.get("ctx", {})
-    path, kind, value, context = _told(path, kind, value, context, descriptions)
+    path, kind, value, context = _specific(path, kind, value, context, descriptions)
     if kind not in SENTENCES:
         return path, error["msg"]
     if kind in ("missing", "extra_forbidden", "decimal_comma", "no_colon"):
@@ -76,7 +76,7 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Complaint
     return path, SENTENCES[kind].format(**words) + _hint(kind, value, words) + "".join(hints)
 
 
-def _told(
+def _specific(
     path: KeyPath, kind: str, value: Any, context: dict[str, Any], known: Collection[str]
 ) -> tuple[KeyPath, str, Any, dict[str, Any]]:
     """Return place, type, value and context for the message, which replace those of pydantic if they are too vague."""

@@ -71,8 +71,8 @@ class Section(BaseModel):
             # The key meant by a misspelt one is not also reported as missing.
             unknown = [str(each["loc"][-1]) for each in details if each["type"] == "extra_forbidden"]
             meant = {closest(name, known) for name in unknown}
-            told = [each for each in details if each["type"] != "missing" or each["loc"][-1] not in meant]
-            problems += [explained(each, known) for each in told]
+            reported = [each for each in details if each["type"] != "missing" or each["loc"][-1] not in meant]
+            problems += [explained(each, known) for each in reported]
         else:
             problems = problems or option_complaints(section) or list(section.complaints())
             if not problems:

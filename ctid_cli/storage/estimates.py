@@ -19,7 +19,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.errors import StorageError, UsageError
 from ctid_cli.storage import columns
-from ctid_cli.storage import folder as place
+from ctid_cli.storage import folder as folders
 from ctid_cli.storage import manifest as plans
 from ctid_cli.storage.column_arrays import ROWS, AnyArray, names_of
 from ctid_cli.storage.export import Export, export_in_memory, open_export, sha256_of
@@ -27,7 +27,7 @@ from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.journal import JournalReader
 from ctid_cli.storage.manifest import Key, Manifest, Slot
 from ctid_cli.storage.sqlite_file import EXPORT
-from ctid_cli.storage.truth import ERRORS, VALUES, Found, failures, found_under, judged
+from ctid_cli.storage.truth import ERRORS, VALUES, Found, failures, found_under, satisfied
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,7 +48,7 @@ def read_estimates(folder: Path, names: Sequence[str] | None = None) -> pd.DataF
 
 def read_stored(folder: Path) -> Estimates:
     """Return the estimates of the latest plan of an experiment."""
-    with place.reading_journal(folder) as log:
+    with folders.reading_journal(folder) as log:
         return stored_in(folder, log)
 
 
@@ -68,7 +68,7 @@ def stored_in(folder: Path, log: JournalReader | None) -> Estimates:
 
 def _times_in(folder: Path, *part: Any) -> Any:
     """Return the times stored in a journal."""
-    with place.reading_journal(folder) as log:
+    with folders.reading_journal(folder) as log:
         return {} if log is None else log.times(*part)
 
 
@@ -176,7 +176,7 @@ class Estimates:
         if name == "true_delay":
             return self._by_block(lambda block: self._truths[block.cell["hash"]].get("delay"))
         if name == "converged":
-            return [None if value != value else bool(value) for value in self.judged.tolist()]
+            return [None if value != value else bool(value) for value in self.satisfied.tolist()]
         values: list[Any] = self._span(lambda first, last: self.export.values(known[name], first, last))
         return values
 
@@ -236,11 +236,11 @@ class Estimates:
     @property
     def converged(self) -> BoolArray | None:
         """Mask of the estimates that satisfy the success rule; None unless the rule applies to all of them."""
-        found = self.judged
+        found = self.satisfied
         return None if not len(found) or np.isnan(found).any() else found.astype(bool)
 
     @cached_property
-    def judged(self) -> Array:
+    def satisfied(self) -> Array:
         """1 for estimates that satisfy the success rule, 0 for others, NaN if no rule applies."""
         found, success = np.full(len(self), np.nan), self.manifest["success"]
         if not success:
@@ -251,7 +251,7 @@ class Estimates:
             own, truth = slice(block.first, block.last), self._truths[block.cell["hash"]]
             some = {name: array if name.endswith("_names") else array[own] for name, array in arrays.items()}
             values = found_under(tuple(truth), some, block.last - block.first).values
-            hits = judged(success, truth, some, values, measures and measures[own])
+            hits = satisfied(success, truth, some, values, measures and measures[own])
             if hits is not None:
                 found[own] = hits
         return found

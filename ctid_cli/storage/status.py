@@ -14,7 +14,7 @@ import numpy as np
 
 from ctid_cli.errors import CtidError, DamageError, UsageError
 from ctid_cli.storage import columns
-from ctid_cli.storage import folder as place
+from ctid_cli.storage import folder as folders
 from ctid_cli.storage.estimates import Estimates, read_stored, stored_in
 from ctid_cli.storage.export import open_export, sha256_of
 from ctid_cli.storage.folder import InUseError
@@ -32,7 +32,7 @@ def find_estimate(results: Path, prefix: str) -> Estimates:
     """Find one estimate among all experiments by a prefix of its id."""
     matches: dict[str, Estimates] = {}
     in_use = ""
-    for folder in place.experiment_folders(results):
+    for folder in folders.experiment_folders(results):
         try:
             stored = read_stored(folder)
         except InUseError as error:
@@ -51,7 +51,7 @@ def find_estimate(results: Path, prefix: str) -> Estimates:
 
 def public_sessions(folder: Path) -> list[dict[str, Any]]:
     """Return the publishable data of the runs that computed an experiment."""
-    with place.reading_journal(folder) as log:
+    with folders.reading_journal(folder) as log:
         if log is None:
             return []
         counts, sessions = log.counts(), log.sessions()
@@ -109,7 +109,7 @@ class ExperimentStatus(Progress):
 def experiment_status(folder: Path) -> ExperimentStatus:
     """Count stored and missing estimates."""
     try:
-        with place.reading_journal(folder) as log:
+        with folders.reading_journal(folder) as log:
             running = _running(folder) if log is not None and log.live else None
             return _status(folder, log, running)
     except InUseError:
@@ -200,7 +200,7 @@ def verify(folder: Path) -> Verification:
     """Read and check everything stored by a run."""
     live, noted, findings = False, None, []
     try:
-        with place.reading_journal(folder) as log:
+        with folders.reading_journal(folder) as log:
             if log is not None:
                 live, noted = log.live, log.exported()
                 findings.append(_journal(log))

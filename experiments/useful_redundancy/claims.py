@@ -36,8 +36,8 @@ def always_converges(results: Results) -> Iterator[Claim]:
     """Test that methods with redundant filters, or without an initial delay, converge from everywhere."""
     estimates = results.estimates
     for name in RELIABLE:
-        judged = estimates.loc[estimates["estimator"] == name, "converged"]
-        if len(judged):
-            percent = 100.0 * judged.sum() / len(judged)
-            shown = f"{percent:.2f} % of {len(judged)}"
+        own = estimates.loc[estimates["estimator"] == name, "converged"]
+        if len(own):
+            percent = 100.0 * own.sum() / len(own)
+            shown = f"{percent:.2f} % of {len(own)}"
             yield within(f"{name} converges", percent, low=ALWAYS, shown=shown)

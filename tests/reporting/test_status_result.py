@@ -85,6 +85,6 @@ def test_what_a_block_and_a_run_have_brought():
     open_, missed = cell("open", 20.0, widest=RMSE), cell("at_most", 15.0, 5000, percentage(1.1))
     assert block_sentence([cell(), open_]) == "1 of 2 data cells need more data sets, up to 613"
     assert precision_sentence([]) == precision_sentence([cell(), open_]) == ""
-    narrow = "200 to 613 data sets in each data cell: all intervals are as narrow as asked for"
+    narrow = "200 to 613 data sets in each data cell: all intervals are as narrow as requested"
     assert precision_sentence([cell(needed=200), cell()]) == narrow
     assert precision_sentence([cell(), missed]).startswith("1 of 2 data cells ended at 5000 data sets with wider")

@@ -18,7 +18,7 @@ from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.journal import open_journal
 from ctid_cli.storage.manifest import true_values
 from ctid_cli.storage.status import experiment_status, find_estimate
-from ctid_cli.storage.truth import arrays_of_rows, found_under, judged
+from ctid_cli.storage.truth import arrays_of_rows, found_under, satisfied
 from tests.storage.made_results import plan_of
 
 MANIFEST = plan_of(5).manifest()
@@ -174,7 +174,7 @@ def test_success_rule(
     estimate: dict[str, Any], success: dict[str, Any] | None, truth: dict[str, float], expected: bool | None
 ) -> None:
     arrays = arrays_of_rows([estimate])
-    hits = judged(success, truth, arrays, found_under(tuple(truth), arrays, 1).values, None)
+    hits = satisfied(success, truth, arrays, found_under(tuple(truth), arrays, 1).values, None)
     assert (None if hits is None else hits.tolist()) == (None if expected is None else [expected])
 
 

@@ -7,7 +7,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.reporting.figures.estimate_plot import box_drawing
 from ctid_cli.reporting.figures.measure_plot import measure_drawing
 from ctid_cli.reporting.figures.style import Drawing, require_kind
-from ctid_cli.reporting.measures import asked_measures, default_measures
+from ctid_cli.reporting.measures import default_measures, requested_measures
 from ctid_cli.reporting.results import Results
 
 Kind = Literal["measure", "box"]
@@ -29,11 +29,11 @@ def kinds_of(results: Results) -> list[Kind]:
 
 def main_measure(results: Results) -> str:
     """Return the default measure: that of the specification, its rule of success, or the errors."""
-    asked = asked_measures(results)
-    if not asked and results.settings.get("success"):
+    named = requested_measures(results)
+    if not named and results.settings.get("success"):
         return "percent"
     # The root mean square error, the last one, is more informative than the bias.
-    return next(reversed(default_measures(results) if not asked else asked[:1]), "cpu")
+    return next(reversed(default_measures(results) if not named else named[:1]), "cpu")
 
 
 def chosen_kind(results: Results, kind: str | None = None, measure: str | None = None) -> Kind:

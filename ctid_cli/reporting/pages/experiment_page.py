@@ -78,7 +78,7 @@ def _question(results: Results) -> Iterator[Section]:
         text = (results.folder / SPEC).read_text(encoding="utf-8")
     except OSError:
         return
-    where, same = (" beside its record", "") if seed is None else ("", ": the same seed gives the same data sets")
+    where, same = (" next to its record", "") if seed is None else ("", ": the same seed gives the same data sets")
     yield Section("The specification", [f"Save it as a file{where} and run `ctid run FILE`{same}.", text + "\n"])
 
 
@@ -134,8 +134,8 @@ def _outcomes(results: Results, out: Path) -> list[Section]:
 def _provenance(results: Results, sessions: list[dict[str, Any]]) -> Iterator[Section]:
     """Yield the origin of the results."""
     seed = results.manifest["seed"]
-    sown = "" if seed is None else f", seed {seed}"
-    made = f"Specification {results.manifest['spec_hash'][:16]}{sown}; page by ctid {ctid_cli.__version__}."
+    of_seed = "" if seed is None else f", seed {seed}"
+    made = f"Specification {results.manifest['spec_hash'][:16]}{of_seed}; page by ctid {ctid_cli.__version__}."
     origins = [(each.code_version, each.platform, _versions(dict(each.packages))) for each in results.stored.origins]
     yield Section(sentences=[made], frame=pd.DataFrame(origins, columns=["code version", "platform", "libraries"]))
     if sessions:
