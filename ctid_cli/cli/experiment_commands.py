@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 _STOPPED = {
     "time budget": "stopped at the end of the time budget",
     "failures": "stopped at the number of failures that --max-failures allows",
-    "machine": "stopped because the machine did not let estimates finish",
+    "machine": "stopped because this machine could not finish all estimates",
 }
 #: Most changed settings that are listed.
 CHANGES = 3

@@ -87,15 +87,12 @@ class RunSummary:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of a command: 0 if everything is stored, 130 or 143 after a signal, 5 after another stop.
-
-        8 where the machine stood in the way.
-        """
+        """Exit code: 0 if everything is stored, 130 or 143 after a signal, 8 for lack of resources, else 5."""
         return 0 if self.stopped_by is None else _EXIT_CODES.get(self.stopped_by, STOPPED)
 
     def machine_error(self) -> MachineError:
-        """Return what to say where the machine stood in the way."""
-        text = f"{self.experiment}: the machine did not let estimates finish, {self.missing} are missing"
+        """Return the error of a run that the machine had not the resources to finish."""
+        text = f"{self.experiment}: this machine could not finish all estimates, {self.missing} are missing"
         if self.given_up:
             more = ", …" if len(self.given_up) > NAMED else ""
             text += f" ({', '.join(self.given_up[:NAMED])}{more})"
@@ -169,7 +166,7 @@ def run_experiment(
         states, plan = States.read(log, retry, limits), as_needed(plan, log)
         work = states.workload(plan)
         if work.estimates:
-            # Until workers are at work, a signal ends the process as it ends any other.
+            # Until jobs are submitted, a signal ends the process at once.
             warm(plan)
         stack.enter_context(stopping)
         former = log.manifest()["spec"] if states.stored else None
@@ -239,23 +236,23 @@ class _Run:
                 for outcomes in found:
                     if stopping() and not announced:
                         announced = True
-                        what = f"{PATIENCE:g} s for what is in work; once more to stop at once"
+                        what = f"running estimates have {PATIENCE:g} s; a second signal stops at once"
                         self._report(message=f"stopping ({stopping.reason}): {what}")
                     batch += outcomes
                     if batch and (time.monotonic() - since >= COMMIT_SECONDS or len(batch) >= COMMIT_ESTIMATES):
                         batch = self._commit(batch)
                         since = time.monotonic()
                         if self.failures >= (stopping.failures or math.inf):
-                            stopping.ask(TOO_MANY_FAILURES)
+                            stopping.request(TOO_MANY_FAILURES)
             except (MachineError, RefusedError):
-                # A cluster that is gone does not take with it what it has finished.
+                # Estimates that a lost cluster has finished are stored.
                 self._commit(batch)
                 raise
         self._commit(batch)
         self.given_up += queue.given_up
         self.cause = queue.cause or self.cause
         if queue.is_stuck:
-            stopping.ask(MACHINE)
+            stopping.request(MACHINE)
 
     def _jobs(self) -> Iterator[Job]:
         for job in jobs_of(self.plan, self.states.missing(self.plan)):

@@ -89,8 +89,8 @@ class Plan:
         section = self.spec.monte_carlo
         if section is not None and section.until is not None:
             raise UsageError(
-                f"{self.experiment}: monte_carlo.until decides on all data sets together, and no shard sees those of "
-                f"the others; give their number, for example --runs {section.most}. After the merge, ctid run without "
+                f"{self.experiment}: monte_carlo.until decides on all data sets together, and a shard has only some "
+                f"of them; give their number, for example --runs {section.most}. After the merge, ctid run without "
                 "--shard and --runs takes as many of them as the precision needs"
             )
         return dataclasses.replace(self, shard=shard)

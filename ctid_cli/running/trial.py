@@ -37,7 +37,7 @@ from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource
 from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.joint_checks import MAX_TRIALS
 from ctid_cli.specification.load import load_spec
-from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.messages import Violation
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.sweeps import Failure, Variant, grouped, swept_in, variants
 from ctid_cli.specification.system_sections import start_points
@@ -96,8 +96,8 @@ class Found:
     """Result of a trial."""
 
     #: Errors to correct, and problems that may not occur with other data.
-    errors: list[Complaint] = field(default_factory=list)
-    warnings: list[Complaint] = field(default_factory=list)
+    errors: list[Violation] = field(default_factory=list)
+    warnings: list[Violation] = field(default_factory=list)
 
 
 def try_out(spec: Spec) -> Found:
@@ -176,9 +176,9 @@ def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], succe
             if tried and time.monotonic() > end:
                 break
             first = not tried
-            data, complaints = _first_data(setting.cell.source)
+            data, violations = _first_data(setting.cell.source)
             tried[_DATA].append(setting.swept)
-            failures[_DATA] += [(path, text, setting.swept) for path, text in complaints]
+            failures[_DATA] += [(path, text, setting.swept) for path, text in violations]
             for candidate in candidates if data is not None else ():
                 name, swept, unusable = candidate.name, {**setting.swept, **candidate.swept}, ""
                 if not candidate.is_custom:
@@ -198,7 +198,7 @@ def _custom_parts(source: Any) -> dict[str, Any]:
     return {place: part for place, part in parts.items() if is_custom(part)}
 
 
-def _first_data(source: Any) -> tuple[Any, list[Complaint]]:
+def _first_data(source: Any) -> tuple[Any, list[Violation]]:
     """Return the first data set of a source; or None, and the problems if its sections cause the error."""
     custom = _custom_parts(source)
     try:

@@ -24,7 +24,7 @@ from ctid_cli.simulation.dataset import located
 from ctid_cli.simulation.start_points import additive_form
 from ctid_cli.specification import sweeps
 from ctid_cli.specification.custom_sections import CustomMeasureSection
-from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.messages import Violation
 from ctid_cli.specification.sections import place_of
 from ctid_cli.specification.spec import OF_DATA, Spec
 from ctid_cli.specification.sweeps import Case, Cases
@@ -58,9 +58,9 @@ def too_many_cases(spec: Spec) -> str:
     return ""
 
 
-def joint_complaints(
-    spec: Spec, broken: frozenset[str], trial: Callable[[Spec], Iterable[Complaint]], *, files_are_good: bool
-) -> list[Complaint]:
+def joint_violations(
+    spec: Spec, broken: frozenset[str], trial: Callable[[Spec], Iterable[Violation]], *, files_are_good: bool
+) -> list[Violation]:
     """Return the contradictions between sections of a specification, and the problems found by a trial."""
     found = [*_of_names(spec), *_of_missing(spec, broken), *_of_kinds(spec, broken)]
     cases = cases_of(spec, files_are_good=files_are_good)
@@ -158,7 +158,7 @@ def _single_cases(spec: Spec) -> dict[str, dict[KeyPath, list[Case]]]:
 # Names and missing sections
 
 
-def _of_names(spec: Spec) -> Iterator[Complaint]:
+def _of_names(spec: Spec) -> Iterator[Violation]:
     """Yield unknown and duplicate measures."""
     names: set[str] = set()
     for k, one in enumerate(spec.measures or ()):
@@ -178,7 +178,7 @@ def _of_names(spec: Spec) -> Iterator[Complaint]:
             yield ("estimators", name), f"the same settings as {other!r}; its estimates would be the same too"
 
 
-def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
+def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Violation]:
     """Yield missing sections, except those that are present but invalid."""
     place = ("monte_carlo", "until", "percent_half_width")
     until = None if spec.monte_carlo is None or spec.data is not None else spec.monte_carlo.until
@@ -204,7 +204,7 @@ def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
             yield ("sampling", "kind"), "must be regular in a loop: the controller is discrete and acts at every sample"
 
 
-def _of_kinds(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
+def _of_kinds(spec: Spec, broken: frozenset[str]) -> Iterator[Violation]:
     """Yield estimators and success rules that belong to the other kind of experiment."""
     on_signal = spec.signal is not None
     if not on_signal and ("signal" in broken or (spec.system is None and spec.data is None)):
@@ -231,17 +231,17 @@ def _is_regular(spec: Spec) -> bool:
 # Records and loops
 
 
-def _of_length(length: int) -> Iterator[Complaint]:
+def _of_length(length: int) -> Iterator[Violation]:
     if length > MAX_SAMPLES:
         yield ("length",), f"more than {MAX_SAMPLES} samples in a record are not supported"
 
 
-def _of_delay(system: Any, duration: float) -> Iterator[Complaint]:
+def _of_delay(system: Any, duration: float) -> Iterator[Violation]:
     if system.delay >= duration:
         yield ("system", "delay"), f"{system.delay:g} s is not shorter than the record ({duration:g} s)"
 
 
-def _of_greatest_delay(estimator: Any, duration: float) -> Iterator[Complaint]:
+def _of_greatest_delay(estimator: Any, duration: float) -> Iterator[Violation]:
     bounds = getattr(estimator, "delay_bounds", None)
     key, latest = ("delay", getattr(estimator, "delay", 0.0)) if bounds is None else ("delay_bounds", bounds[1])
     if latest >= duration and latest > 0:
@@ -249,25 +249,25 @@ def _of_greatest_delay(estimator: Any, duration: float) -> Iterator[Complaint]:
         yield ("estimator", key), text
 
 
-def _of_clock_periods(generator: Any, duration: float) -> Iterator[Complaint]:
+def _of_clock_periods(generator: Any, duration: float) -> Iterator[Violation]:
     clock = getattr(generator, "clock_period", None)
     if clock is not None and duration / clock > MAX_SAMPLES:
         message = f"a record of {duration:g} s has more than {MAX_SAMPLES} clock periods of {clock:g} s"
         yield ("generator", "clock_period"), message
 
 
-def _of_ratio(loop: Any, noise: Any) -> Iterator[Complaint]:
+def _of_ratio(loop: Any, noise: Any) -> Iterator[Violation]:
     if noise.snr_db is not None:
         other = ", or its innovation_variance" if hasattr(noise, "innovation_variance") else ""
         yield ("noise", "snr_db"), f"in a loop the noise feeds back into the output; give the noise's variance{other}"
 
 
-def _of_relay(loop: Any, data: Any) -> Iterator[Complaint]:
+def _of_relay(loop: Any, data: Any) -> Iterator[Violation]:
     if isinstance(loop.controller, Relay):
         yield ("loop",), "a relay is for simulated data; leave the loop out, the record of its input says enough"
 
 
-def _of_unstable_system(feedback: Any, system: Any) -> Iterator[Complaint]:
+def _of_unstable_system(feedback: Any, system: Any) -> Iterator[Violation]:
     """Yield an unstable system without a linear loop; a trial shows whether a loop stabilises it."""
     if feedback is not None and not isinstance(feedback.controller, Relay):
         return
@@ -292,7 +292,7 @@ def _unstable(poles: ComplexArray) -> str:
     return f"{noun} at {', '.join(offending)} rad/s; {remedy}"
 
 
-def _of_custom_system(loop: Any, custom_system: Any) -> Iterator[Complaint]:
+def _of_custom_system(loop: Any, custom_system: Any) -> Iterator[Violation]:
     yield ("system", "kind"), "a loop needs a transfer function in it; give excitation in place of loop"
 
 
@@ -300,7 +300,7 @@ def _of_custom_system(loop: Any, custom_system: Any) -> Iterator[Complaint]:
 # Starts and true values
 
 
-def _of_start(start: Sequence[Start], named: tuple[str, Any]) -> Iterator[Complaint]:
+def _of_start(start: Sequence[Start], named: tuple[str, Any]) -> Iterator[Violation]:
     name, estimator = named
     for one in start:
         if getattr(estimator, "start_from", None) == ("delay" if one.model is None else "parameters"):
@@ -311,7 +311,7 @@ def _of_start(start: Sequence[Start], named: tuple[str, Any]) -> Iterator[Compla
                 return
 
 
-def _of_relative_start(relative_start: Any, system: Any, named: tuple[str, Any]) -> Iterator[Complaint]:
+def _of_relative_start(relative_start: Any, system: Any, named: tuple[str, Any]) -> Iterator[Violation]:
     try:
         model = additive_form(system)
     except DataError as error:
@@ -321,16 +321,16 @@ def _of_relative_start(relative_start: Any, system: Any, named: tuple[str, Any])
         yield from ((("relative_start",), text) for _, text in _of_start([Start(model=model)], named))
 
 
-def _of_unknown_parameters(relative_start: Any, data: Any) -> Iterator[Complaint]:
+def _of_unknown_parameters(relative_start: Any, data: Any) -> Iterator[Violation]:
     unknown = "the parameters of a measured record are not known"
     yield ("relative_start",), f"{unknown}; give values: {{additive: [submodels]}}"
 
 
-def _of_unknown_structure(relative_start: Any, custom_system: Any) -> Iterator[Complaint]:
+def _of_unknown_structure(relative_start: Any, custom_system: Any) -> Iterator[Violation]:
     yield ("relative_start",), "a custom system has no known structure; give values: {additive: [submodels]}"
 
 
-def _of_relative_errors(success: Any, truth: Mapping[str, float]) -> Iterator[Complaint]:
+def _of_relative_errors(success: Any, truth: Mapping[str, float]) -> Iterator[Violation]:
     delays = [name for name in truth if is_delay(name)]
     rules = {"delay_relative_error": delays or ["delay"], "parameter_relative_error": [*truth.keys() - {*delays}]}
     for rule, names in rules.items():
@@ -343,23 +343,23 @@ def _of_relative_errors(success: Any, truth: Mapping[str, float]) -> Iterator[Co
             yield ("success", rule), f"{text}; use fit_percent, or leave it out"
 
 
-def _of_unknown_values(success: Any, data: Any) -> Iterator[Complaint]:
+def _of_unknown_values(success: Any, data: Any) -> Iterator[Violation]:
     for rule, unknown in (("delay_relative_error", "true values"), ("parameter_relative_error", "parameters")):
         if getattr(success, rule) is not None:
             text = f"the {unknown} of a measured record are not known; use fit_percent, or leave it out"
             yield ("success", rule), text
 
 
-def _of_one_record(until: Any, data: Any) -> Iterator[Complaint]:
+def _of_one_record(until: Any, data: Any) -> Iterator[Violation]:
     yield ("until",), "a measured record is one data set; give runs: 1 in place of until and at_most"
 
 
-def _of_error_of_a_signal(until: Any, signal: Any) -> Iterator[Complaint]:
+def _of_error_of_a_signal(until: Any, signal: Any) -> Iterator[Violation]:
     if until.rmse_relative is not None:
         yield ("until", "rmse_relative"), "needs the true values of a simulated system; use percent_half_width"
 
 
-def _of_error(until: Any, truth: Mapping[str, float]) -> Iterator[Complaint]:
+def _of_error(until: Any, truth: Mapping[str, float]) -> Iterator[Violation]:
     if until.rmse_relative is not None and not truth:
         yield ("until", "rmse_relative"), "needs true values: system.truth: {gain: 1.0}"
 
@@ -368,19 +368,19 @@ def _of_error(until: Any, truth: Mapping[str, float]) -> Iterator[Complaint]:
 # Frequencies of a signal
 
 
-def _of_frequencies(signal: Any, sampling: Any) -> Iterator[Complaint]:
+def _of_frequencies(signal: Any, sampling: Any) -> Iterator[Violation]:
     highest, limit = signal.highest_frequency, math.pi / sampling.mean_interval
     if highest >= limit:
         yield ("sampling", "interval"), f"shows frequencies below {limit:.4g} rad/s only, the signal has {highest:g}"
 
 
-def _of_steps(signal: Any, duration: float) -> Iterator[Complaint]:
+def _of_steps(signal: Any, duration: float) -> Iterator[Violation]:
     for step in signal.steps:
         if step >= duration:
             yield ("signal", "tones"), f"a step at {step:g} s comes after the last sample, {duration:g} s"
 
 
-def _of_times(success: Any, signal: Any, sampling: Any) -> Iterator[Complaint]:
+def _of_times(success: Any, signal: Any, sampling: Any) -> Iterator[Violation]:
     duration = sampling.mean_interval * sampling.length
     low, high = success.window or (0.0, duration)
     if high > duration * (1 + 1e-9) or high - low < sampling.mean_interval:
@@ -389,14 +389,14 @@ def _of_times(success: Any, signal: Any, sampling: Any) -> Iterator[Complaint]:
         yield ("success", "by"), f"{success.by:g} s come after the end of the record, {duration:g} s"
 
 
-def _of_tones(estimator: Any, signal: Any, disturbance: Any) -> Iterator[Complaint]:
+def _of_tones(estimator: Any, signal: Any, disturbance: Any) -> Iterator[Violation]:
     count, sine = len(signal.tones), isinstance(disturbance, SineDisturbance)
     if estimator.tones != count and not (sine and estimator.tones == count + 1):
         more = ", or one more for the sinusoid that disturbs it" if sine else ""
         yield ("estimator", "tones"), f"must be {count}, as many as the signal has{more}, not {estimator.tones}"
 
 
-def _of_options(estimator: Any, signal: Any, sampling: Any) -> Iterator[Complaint]:
+def _of_options(estimator: Any, signal: Any, sampling: Any) -> Iterator[Violation]:
     try:
         with np.errstate(all="ignore"):
             estimator.check(sampling.samples, sampling.interval)

@@ -12,7 +12,7 @@ from ctid_cli.models.controller import Relay
 from ctid_cli.models.transfer_function import TransferFunction, cancelled
 from ctid_cli.signals.noise import stream
 from ctid_cli.specification.joint_checks import MAX_TRIALS, cases_of
-from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.messages import Violation
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.sweeps import checked, variants
 
@@ -23,7 +23,7 @@ TIME_CONSTANTS = 3.0
 ON_TIME = 1e-6
 
 
-def joint_warnings(spec: Spec) -> list[Complaint]:
+def joint_warnings(spec: Spec) -> list[Violation]:
     """Return the warnings."""
     cases = cases_of(spec)
     warnings = [*checked(cases, CHECKS), *checked(cases, (_of_sampled_input,), MAX_TRIALS)]
@@ -39,12 +39,12 @@ def joint_warnings(spec: Spec) -> list[Complaint]:
 # The record
 
 
-def _of_runs(monte_carlo: Any, data: Any) -> Iterator[Complaint]:
+def _of_runs(monte_carlo: Any, data: Any) -> Iterator[Violation]:
     if monte_carlo.most > 1:
         yield ("monte_carlo", "runs"), "a measured record is one data set; it is run once"
 
 
-def _of_slow_sampling(system: Any, sampling: Any) -> Iterator[Complaint]:
+def _of_slow_sampling(system: Any, sampling: Any) -> Iterator[Violation]:
     interval, fastest = sampling.mean_interval, float(np.abs(system.poles).max(initial=0.0))
     if interval * fastest > math.pi:
         slow = f"sampling every {interval:g} s is slower than twice the fastest pole ({fastest:.4g} rad/s)"
@@ -52,7 +52,7 @@ def _of_slow_sampling(system: Any, sampling: Any) -> Iterator[Complaint]:
         yield ("sampling", *key), f"{slow}; intervals below {math.pi / fastest:.4g} s see it"
 
 
-def _of_short_record(system: Any, duration: float) -> Iterator[Complaint]:
+def _of_short_record(system: Any, duration: float) -> Iterator[Violation]:
     # A lightly damped mode is visible within one period, long before it has decayed.
     frequencies = np.abs(system.poles)
     slowest = float(1.0 / frequencies[frequencies > 0.0].min(initial=math.inf))
@@ -64,14 +64,14 @@ def _of_short_record(system: Any, duration: float) -> Iterator[Complaint]:
         yield ("duration",), f"{short}, whose time constant is {slowest:.4g} s; {cure}"
 
 
-def _of_cancellation(system: Any) -> Iterator[Complaint]:
+def _of_cancellation(system: Any) -> Iterator[Violation]:
     for part in getattr(system, "submodels", [system] if isinstance(system, TransferFunction) else []):
         if place := cancelled(part.numerator, part.denominator):
             cure = "leave both out, unless that is the point"
             yield ("system",), f"a zero cancels the pole at s = {place}, so that no data determine either; {cure}"
 
 
-def _of_sampled_input(excitation: Any, sampling: Any, seed: int) -> Iterator[Complaint]:
+def _of_sampled_input(excitation: Any, sampling: Any, seed: int) -> Iterator[Violation]:
     if sampling.input_record != "sampled":
         return
     try:
@@ -96,7 +96,7 @@ def _of_sampled_input(excitation: Any, sampling: Any, seed: int) -> Iterator[Com
 # Estimators
 
 
-def _of_open_loop(loop: Any, estimator: Any) -> Iterator[Complaint]:
+def _of_open_loop(loop: Any, estimator: Any) -> Iterator[Violation]:
     if not isinstance(loop.controller, Relay) and getattr(estimator, "instruments", "open_loop") == "open_loop":
         ignored = "ignores the loop, through which noise reaches the input and biases the estimate"
         cure = "use srivc or additive_srivc with instruments: closed_loop, unless that is the point"
@@ -108,7 +108,7 @@ def _own(estimator: Any, name: str) -> Any:
     return estimator.of_input(name) if name and hasattr(estimator, "of_input") else estimator
 
 
-def _of_delay(driven: tuple[str, Any], estimator: Any) -> Iterator[Complaint]:
+def _of_delay(driven: tuple[str, Any], estimator: Any) -> Iterator[Violation]:
     name, system = driven
     estimator = _own(estimator, name)
     true, bounds, known = system.delay, getattr(estimator, "delay_bounds", None), getattr(estimator, "delay", None)
@@ -124,13 +124,13 @@ def _of_delay(driven: tuple[str, Any], estimator: Any) -> Iterator[Complaint]:
         )
 
 
-def _of_white_formula(noise: Any, estimator: Any) -> Iterator[Complaint]:
+def _of_white_formula(noise: Any, estimator: Any) -> Iterator[Violation]:
     if getattr(noise, "coloured", False) and getattr(estimator, "covariance", "") == "white":
         short = "is for white noise and the noise is coloured, so that the intervals are too short or too long"
         yield ("estimator", "covariance"), f"{short}; write covariance: auto, unless that is the point"
 
 
-def _of_structure(driven: tuple[str, Any], estimator: Any) -> Iterator[Complaint]:
+def _of_structure(driven: tuple[str, Any], estimator: Any) -> Iterator[Violation]:
     """Yield an estimator whose model structure does not contain the system."""
     name, system = driven
     estimator = _own(estimator, name)
@@ -156,12 +156,12 @@ def _degrees(model: Any) -> Sequence[int]:
 # Frequencies of a signal
 
 
-def _of_whole_record(estimator: Any, signal: Any) -> Iterator[Complaint]:
+def _of_whole_record(estimator: Any, signal: Any) -> Iterator[Violation]:
     if estimator.whole_record and signal.frequency_steps:
         yield ("estimator", "kind"), "gives one estimate of the whole record, in which a frequency steps"
 
 
-def _of_warnings(estimator: Any, signal: Any, sampling: Any) -> Iterator[Complaint]:
+def _of_warnings(estimator: Any, signal: Any, sampling: Any) -> Iterator[Violation]:
     for name, text in estimator.warnings(sampling.interval, signal.highest_frequency):
         yield ("estimator", name), text
 

@@ -13,7 +13,7 @@ from ctid_cli.specification.yaml_source import KEY, KeyPath
 from ctid_cli.text import did_you_mean
 
 #: Key path inside a section, and the problem there.
-Complaint = tuple[KeyPath, str]
+Violation = tuple[KeyPath, str]
 
 #: Prefix of the tags of unions, which pydantic puts into error locations; no text from YAML contains it.
 TAG = "\0"
@@ -53,13 +53,13 @@ def wrong(message: str) -> PydanticCustomError:
     return PydanticCustomError("said", "{message}", {"message": message})
 
 
-def several_wrong(title: str, problems: Iterable[Complaint]) -> ValidationError:
+def several_wrong(title: str, problems: Iterable[Violation]) -> ValidationError:
     """Return one validation error with several problems."""
     details = [InitErrorDetails(type=wrong(message), loc=path, input=None) for path, message in problems]
     return ValidationError.from_exception_data(title, details)
 
 
-def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Complaint:
+def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Violation:
     """Return the place and message of a pydantic error in a section with the given field descriptions."""
     parts = [str(part) for part in error["loc"]]
     path = tuple(part for part in error["loc"] if not str(part).startswith(TAG))

@@ -18,7 +18,7 @@ def kinds_of(results: Results) -> list[Kind]:
     if not len(results.stored):
         raise UsageError(f"{results.experiment} has no stored estimates yet; run it first")
     if results.settings.get("data") is not None:
-        one = f"{results.experiment} is about one measured record, so that there is nothing to draw over data sets"
+        one = f"{results.experiment} has one measured record, and these figures show several data sets"
         raise UsageError(f"{one}; ctid fit draws a fit")
     kinds: list[Kind] = ["measure"]
     if results.is_simulated:
@@ -43,7 +43,7 @@ def chosen_kind(results: Results, kind: str | None = None, measure: str | None =
         return "measure" if measure is not None else known[0]
     require_kind(kind, get_args(Kind))
     if kind not in known:
-        raise UsageError(f"{results.experiment} has nothing to draw as {kind}; it has {', '.join(known)}")
+        raise UsageError(f"{results.experiment} has no figure of kind {kind}; it has {', '.join(known)}")
     return kind
 
 
