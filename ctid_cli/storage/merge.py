@@ -63,19 +63,19 @@ def find_sources(paths: Iterable[Path]) -> list[Path]:
 
 
 def merge_all(
-    folders: Iterable[Path], out: Path, *, allow_mixed: bool = False, partial: bool = False
+    sources: Iterable[Path], out: Path, *, allow_mixed: bool = False, partial: bool = False
 ) -> Iterator[Merged]:
     """Merge the folders of each experiment into the folder of its name."""
     experiments: dict[str, list[Path]] = defaultdict(list)
-    for folder in folders:
+    for folder in sources:
         experiments[_plan_of(folder)["experiment"]].append(folder)
     for name, places in experiments.items():
         yield merge(places, out / name, allow_mixed=allow_mixed, partial=partial)
 
 
-def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, partial: bool = False) -> Merged:
+def merge(sources: Iterable[Path], target: Path, *, allow_mixed: bool = False, partial: bool = False) -> Merged:
     """Merge folders of one experiment into a target, which may already hold some of the estimates."""
-    others = [folder for folder in folders if not (target.exists() and folder.samefile(target))]
+    others = [folder for folder in sources if not (target.exists() and folder.samefile(target))]
     if not others:
         raise UsageError(f"there is nothing to merge into {target} but itself")
     plans = {folder: _plan_of(folder) for folder in others}
