@@ -101,22 +101,14 @@ def joined(tables: Sequence[TableResult]) -> TableResult:
 
 def labels_of(frame: pd.DataFrame, *others: str, options: Sequence[str] = ()) -> pd.DataFrame:
     """Return the identifying columns as text: swept fields but ``options``, starts, and other keys that any row has."""
-    keys = [key for key in settings_of(frame) if key not in options]
-    texts = {setting_title(key): [setting_text(key, value) for value in frame[key]] for key in keys if _has(frame, key)}
-    if _has(frame, "initial_delay"):
-        texts["initial delay"] = [
-            delay_label(None if _is_missing(value) else value) for value in frame["initial_delay"]
-        ]
-    texts |= {key: [number(value) for value in frame[key]] for key in others if _has(frame, key)}
+    known = frame.loc[:, frame.notna().any()].astype(object)
+    known = known.where(known.notna(), None)
+    keys = [key for key in settings_of(known) if key not in options]
+    texts = {setting_title(key): [setting_text(key, value) for value in known[key]] for key in keys}
+    if "initial_delay" in known:
+        texts["initial delay"] = [delay_label(delay) for delay in known["initial_delay"]]
+    texts |= {key: [number(value) for value in known[key]] for key in others if key in known}
     return pd.DataFrame(texts, index=frame.index)
-
-
-def _has(frame: pd.DataFrame, key: str) -> bool:
-    return key in frame and bool(frame[key].notna().any())
-
-
-def _is_missing(value: Any) -> bool:
-    return value is None or value != value
 
 
 def pivot(texts: pd.DataFrame, down: Sequence[str], across: str, shown: Sequence[str], empty: str = "") -> pd.DataFrame:
