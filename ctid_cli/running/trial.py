@@ -1,6 +1,7 @@
 """Trial of a specification: find errors that only its first data sets show, before anything is stored.
 
-The first data set of each setting is simulated, and every estimator prepared on it. Custom components are tried in a
+The first data set of each setting is simulated, and every estimator prepared on it; those that theory says are biased
+get a warning. Custom components are tried in a
 separate process, under limits and twice, with the global random generators in two states: results that differ the
 second time are not reproducible. Custom estimators are also fitted to the first data set. A component that ends its
 process, or takes too long, is left to the run, which stores the failure for every estimate.
@@ -166,9 +167,12 @@ def _try_under_limits(limits: Limits, late: Path, *given: Any) -> Found:
 
 def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], success: Mapping[str, Any]) -> Found:
     """Simulate the first data set of each setting, and prepare every estimator on it."""
+    from ctid_cli.simulation.expected_accuracy import why_biased
+
     found, end = Found(), time.monotonic() + MAX_SECONDS
-    #: Problems of the data, and of each estimator by name, with the swept values that were tried.
+    #: Problems of the data, and of each estimator by name, with the swept values that were tried; biased estimators.
     failures: dict[str, list[Failure]] = defaultdict(list)
+    biased: dict[str, list[Failure]] = defaultdict(list)
     tried: dict[str, list[Mapping[KeyPath, Any]]] = defaultdict(list)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
@@ -185,10 +189,13 @@ def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], succe
                     unusable = _unusable(candidate.estimator, data)
                     tried[name].append(swept)
                     failures[name] += [(("estimators", name), unusable, swept)] if unusable else []
+                    why = why_biased(setting.cell.source, candidate.estimator)
+                    biased[name] += [(("estimators", name), f"is biased: {why}", swept)] if why else []
                 if first and not unusable and (candidate.is_custom or setting.cell.measures):
                     _fit(candidate, data, setting, [one.estimator for one in candidates], success, found)
-    for subject, some in failures.items():
-        found.errors.extend(grouped(some, tried[subject]))
+    for subject in tried:
+        found.errors.extend(grouped(failures[subject], tried[subject]))
+        found.warnings.extend(grouped(biased[subject], tried[subject]))
     return found
 
 

@@ -1,14 +1,12 @@
 """Warnings about valid but questionable settings of a specification, before anything is run."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from ctid_cli.errors import DataError
-from ctid_cli.models.additive import degrees_of
-from ctid_cli.models.controller import Relay
 from ctid_cli.models.transfer_function import TransferFunction, cancelled
 from ctid_cli.signals.noise import stream
 from ctid_cli.specification.joint_checks import MAX_TRIALS, cases_of
@@ -96,60 +94,10 @@ def _of_sampled_input(excitation: Any, sampling: Any, seed: int) -> Iterator[Vio
 # Estimators
 
 
-def _of_open_loop(loop: Any, estimator: Any) -> Iterator[Violation]:
-    if not isinstance(loop.controller, Relay) and getattr(estimator, "instruments", "open_loop") == "open_loop":
-        ignored = "ignores the loop, through which noise reaches the input and biases the estimate"
-        cure = "use srivc or additive_srivc with instruments: closed_loop, unless that is the point"
-        yield ("estimator",), f"{ignored}; {cure}"
-
-
-def _own(estimator: Any, name: str) -> Any:
-    """Return the estimator for one of several named inputs."""
-    return estimator.of_input(name) if name and hasattr(estimator, "of_input") else estimator
-
-
-def _of_delay(driven: tuple[str, Any], estimator: Any) -> Iterator[Violation]:
-    name, system = driven
-    estimator = _own(estimator, name)
-    true, bounds, known = system.delay, getattr(estimator, "delay_bounds", None), getattr(estimator, "delay", None)
-    if bounds is not None and not bounds[0] <= true <= bounds[1]:
-        outside = f"[{bounds[0]:g}, {bounds[1]:g}] s do not hold the delay of the system, {true:g} s"
-        cure = f"write delay_bounds: [0, {2 * true:g}], unless that is the point"
-        yield ("estimator", "delay_bounds"), f"{outside}; {cure}"
-    elif bounds is None and known is not None and not math.isclose(known, true):
-        wrong = f"is taken as {known:g} s and the system has {true:g} s, which biases the parameters"
-        yield (
-            ("estimator", "delay"),
-            f"{wrong}; write delay: {true:g}, or estimate it, in open loop with kind: delay_profile",
-        )
-
-
 def _of_white_formula(noise: Any, estimator: Any) -> Iterator[Violation]:
     if getattr(noise, "coloured", False) and getattr(estimator, "covariance", "") == "white":
         short = "is for white noise and the noise is coloured, so that the intervals are too short or too long"
         yield ("estimator", "covariance"), f"{short}; write covariance: auto, unless that is the point"
-
-
-def _of_structure(driven: tuple[str, Any], estimator: Any) -> Iterator[Violation]:
-    """Yield an estimator whose model structure does not contain the system."""
-    name, system = driven
-    estimator = _own(estimator, name)
-    key, more = ("terms", "add to the terms") if hasattr(estimator, "terms") else ("", "")
-    for what, needed, given in zip(("poles", "zeros"), _degrees(system), _degrees(estimator), strict=False):
-        if given < needed:
-            few = f"the system has {needed} {what if needed > 1 else what[:-1]} and this model {given}"
-            cure = more or f"write {what}: {needed}"
-            yield ("estimator", key or what), f"{few}, so that it can only come near; {cure}"
-            return
-
-
-def _degrees(model: Any) -> Sequence[int]:
-    """Return the degrees of denominator and numerator of a system or model as one fraction."""
-    if hasattr(model, "relative_degree"):
-        return model.order, model.order - model.relative_degree
-    if hasattr(model, "terms"):
-        return degrees_of(model.terms)
-    return (model.poles + getattr(model, "integrators", 0), model.zeros) if hasattr(model, "zeros") else ()
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -168,5 +116,5 @@ def _of_warnings(estimator: Any, signal: Any, sampling: Any) -> Iterator[Violati
 
 CHECKS = (
     *(_of_runs, _of_slow_sampling, _of_short_record, _of_cancellation),
-    *(_of_open_loop, _of_delay, _of_white_formula, _of_structure, _of_whole_record, _of_warnings),
+    *(_of_white_formula, _of_whole_record, _of_warnings),
 )
