@@ -1,4 +1,4 @@
-"""Errors of a specification in which every section is valid on its own."""
+"""Errors of a specification in which every section is valid on its own, and warnings about questionable settings."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -16,7 +16,8 @@ from ctid_cli.inference.monte_carlo import MEASURES, requested
 from ctid_cli.kinds import KINDS
 from ctid_cli.models.controller import Relay
 from ctid_cli.models.several_inputs import is_delay
-from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.models.transfer_function import TransferFunction, cancelled
+from ctid_cli.signals.noise import stream
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance
 from ctid_cli.simulation.components import is_custom
@@ -37,6 +38,11 @@ MAX_SAMPLES = 10_000_000
 MAX_SETTINGS = 1_000_000
 #: Maximum number of settings whose first data sets are tried.
 MAX_TRIALS = 64
+#: Minimum record length beyond the delay, in time constants of the slowest pole: in shorter records the standard
+#: error of the pole grows much faster than it would fall with the number of samples in longer ones.
+TIME_CONSTANTS = 3.0
+#: Input edges within this fraction of the sampling interval of a sample count as simultaneous with it.
+ON_TIME = 1e-6
 #: Success rules of systems and of signals.
 _RULES_OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
 _RULES_OF_SIGNALS = ("band", "by", "window")
@@ -95,11 +101,6 @@ def cases_of(spec: Spec, *, files_are_good: bool = True) -> Cases:
         found["disturbance"] = {("disturbance",): [(None, {})]}
     # The loop, if any, that may stabilise an unstable system.
     found["feedback"] = {("loop",): [(None, {})]} if spec.loop is None else found["loop"]
-    # The systems, each with the name of its input if there are several.
-    found["driven"] = {
-        path: [(("" if path[1:] == () else str(path[1]), one), swept) for one, swept in cases]
-        for path, cases in found["system"].items()
-    }
     found["generator"] = {path: _cases(spec, path, section) for path, section in spec.generators.items()}
     found["truth"] = {
         path: [(truth_of(one), sweeps.swept_in({path: one})) for one in sweeps.variants(section)]
@@ -423,4 +424,96 @@ CHECKS = (
     *(_of_start, _of_relative_start, _of_unknown_parameters, _of_unknown_structure),
     *(_of_relative_errors, _of_unknown_values, _of_one_record, _of_error_of_a_signal, _of_error),
     *(_of_frequencies, _of_steps, _of_times, _of_tones, _of_options),
+)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Warnings about valid but questionable settings
+
+
+def joint_warnings(spec: Spec) -> list[Violation]:
+    """Return the warnings."""
+    cases = cases_of(spec)
+    warnings = [*sweeps.checked(cases, WARNINGS), *sweeps.checked(cases, (_of_sampled_input,), MAX_TRIALS)]
+    if spec.starts is not None:
+        first = [sweeps.variants(section)[0].options for section in spec.estimators.values()]
+        taken = {getattr(options, "start_from", None) for options in first}
+        for name, kind in (("initial_delay", "delay"), ("parameters", "parameters")):
+            if getattr(spec.starts, name) and kind not in taken:
+                warnings.append((("starts", name), "no estimator here uses a start of this kind; each is run once"))
+    return warnings
+
+
+def _of_runs(monte_carlo: Any, data: Any) -> Iterator[Violation]:
+    if monte_carlo.most > 1:
+        yield ("monte_carlo", "runs"), "a measured record is one data set; it is run once"
+
+
+def _of_slow_sampling(system: Any, sampling: Any) -> Iterator[Violation]:
+    interval, fastest = sampling.mean_interval, float(np.abs(system.poles).max(initial=0.0))
+    if interval * fastest > math.pi:
+        slow = f"sampling every {interval:g} s is slower than twice the fastest pole ({fastest:.4g} rad/s)"
+        key = ("interval",) if hasattr(sampling, "interval") else ()
+        yield ("sampling", *key), f"{slow}; intervals below {math.pi / fastest:.4g} s see it"
+
+
+def _of_short_record(system: Any, duration: float) -> Iterator[Violation]:
+    # A lightly damped mode is visible within one period, long before it has decayed.
+    frequencies = np.abs(system.poles)
+    slowest = float(1.0 / frequencies[frequencies > 0.0].min(initial=math.inf))
+    needed = float(system.delay + TIME_CONSTANTS * slowest)
+    if duration < needed:
+        delayed = f", {system.delay:g} s of it delay," if system.delay else ""
+        short = f"a record of {duration:.4g} s{delayed} shows little of the slowest pole"
+        cure = f"it must last {needed:.3g} s or more"
+        yield ("duration",), f"{short}, whose time constant is {slowest:.4g} s; {cure}"
+
+
+def _of_cancellation(system: Any) -> Iterator[Violation]:
+    for part in getattr(system, "submodels", [system] if isinstance(system, TransferFunction) else []):
+        if place := cancelled(part.numerator, part.denominator):
+            cure = "leave both out, unless that is the point"
+            yield ("system",), f"a zero cancels the pole at s = {place}, so that no data determine either; {cure}"
+
+
+def _of_sampled_input(excitation: Any, sampling: Any, seed: int) -> Iterator[Violation]:
+    if sampling.input_record != "sampled":
+        return
+    try:
+        times = sampling.times(stream(seed, "sampling", 0))
+        applied = excitation.generate(times, stream(seed, "input", 0))
+    except DataError as error:  # in a case that was not tried
+        yield ("excitation",), f"{error}; estimates of such data sets are stored as FAILED"
+        return
+    if applied.hold != "zoh":
+        return
+    edges = applied.t[1:][np.diff(applied.values) != 0.0]
+    edges = edges[edges < times[-1]]
+    interval = sampling.mean_interval
+    late = times[np.searchsorted(times, edges - ON_TIME * interval)] - edges
+    if late.size and late.mean() > ON_TIME * interval:
+        seen = f"the estimator sees the input at its samples only, each change {late.mean():.2g} s late on average"
+        biased = "which biases delay and parameters; write input_record: exact, unless that is the point"
+        yield ("sampling", "input_record"), f"{seen}, {biased}"
+
+
+def _of_white_formula(noise: Any, estimator: Any) -> Iterator[Violation]:
+    if getattr(noise, "coloured", False) and getattr(estimator, "covariance", "") == "white":
+        short = "is for white noise and the noise is coloured, so that the intervals are too short or too long"
+        yield ("estimator", "covariance"), f"{short}; write covariance: auto, unless that is the point"
+
+
+def _of_whole_record(estimator: Any, signal: Any) -> Iterator[Violation]:
+    if estimator.whole_record and signal.frequency_steps:
+        yield ("estimator", "kind"), "gives one estimate of the whole record, in which a frequency steps"
+
+
+def _of_warnings(estimator: Any, signal: Any, sampling: Any) -> Iterator[Violation]:
+    for name, text in estimator.warnings(sampling.interval, signal.highest_frequency):
+        yield ("estimator", name), text
+
+
+WARNINGS = (
+    *(_of_runs, _of_slow_sampling, _of_short_record, _of_cancellation),
+    *(_of_white_formula, _of_whole_record, _of_warnings),
 )

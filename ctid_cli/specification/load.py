@@ -13,8 +13,7 @@ from ctid_cli.signals.files import is_inside
 from ctid_cli.signals.measurement import read_held_signal
 from ctid_cli.simulation.dataset import LoopOptions, file_sha256, joined, located
 from ctid_cli.specification.custom_sections import names_code
-from ctid_cli.specification.joint_checks import joint_violations, too_many_cases
-from ctid_cli.specification.joint_warnings import joint_warnings
+from ctid_cli.specification.joint_checks import joint_violations, joint_warnings, too_many_cases
 from ctid_cli.specification.messages import Violation, explained, shown
 from ctid_cli.specification.sections import Section
 from ctid_cli.specification.spec import Spec, SpecPart
