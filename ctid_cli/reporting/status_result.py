@@ -71,8 +71,10 @@ class StatusResult(Result):
         sections += [Section(frame=precision_frame(self.precision))] if self.precision else []
         if self.stored is not None:
             found = self.outcomes()
-            notes = [f"and {len(found) - LISTED} more"] if len(found) > LISTED else []
-            sections.append(Section(frame=found.head(LISTED), notes=notes))
+            shown = found.head(LISTED)
+            notes = [f"{one.first}: {one.reason}" for one in shown.itertuples() if one.reason]
+            notes += [f"and {len(found) - LISTED} more"] if len(found) > LISTED else []
+            sections.append(Section(frame=shown.drop(columns="reason"), notes=notes))
         if status.left_aside:
             aside = f"{status.left_aside} stored estimates are set aside: the latest run has other settings."
             aside += " To see them, run their specification again; nothing is computed anew."
@@ -153,12 +155,20 @@ def outcome_frame(stored: Estimates) -> pd.DataFrame:
 
     The reason is the first line of the message, which continues with places in the code; successes have none.
     """
-    texts = {name: np.char.decode(stored.column(name)) for name in ("estimator", "status", "id")}
-    frame = pd.DataFrame(texts).assign(reason="")
+    frame = pd.DataFrame({name: _categories(stored.column(name)) for name in ("estimator", "status")}).assign(reason="")
     failed = ~frame["status"].isin(SUCCESSES).to_numpy()
     frame.loc[failed, "reason"] = [text.partition("\n")[0] for text in stored.chosen(failed).values("message")]
-    groups = frame.groupby(["estimator", "status", "reason"], sort=False)["id"].agg(estimates="size", first="first")
-    return groups.reset_index().sort_values("estimates", ascending=False, kind="stable", ignore_index=True)
+    by = frame.reset_index().groupby(["estimator", "status", "reason"], sort=False, observed=True)["index"]
+    groups = by.agg(estimates="size", first="first").reset_index()
+    groups["first"] = np.char.decode(stored.column("id")[groups["first"]])
+    groups = groups.astype({"estimator": "str", "status": "str"})
+    return groups.sort_values("estimates", ascending=False, kind="stable", ignore_index=True)
+
+
+def _categories(texts: Any) -> pd.Categorical:
+    """Return texts of few different values in little memory."""
+    labels, codes = np.unique(texts, return_inverse=True)
+    return pd.Categorical.from_codes(codes, [label.decode() for label in labels.tolist()])
 
 
 # --- precision ------------------------------------------------------------------------------------------------------
