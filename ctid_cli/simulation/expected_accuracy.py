@@ -86,12 +86,16 @@ def _unbiased(source: SimulatedSource, estimator: Any) -> EstimatedForm:
     estimated = _estimated(system, estimator)
     if loop is None or estimated.instruments != "open_loop" or noise is None:
         return estimated
-    if isinstance(loop.controller, ContinuousController):
+    controller = loop.controller
+    if isinstance(controller, ContinuousController):
         what = "the controller acts in continuous time, so that the input is correlated with the noise"
         raise BiasedError(f"{what} (closed_loop instruments are not)")
-    discrete = isinstance(sampling, RegularSampling) and isinstance(loop.controller, DiscreteController)
-    if discrete and isinstance(noise, Noise):
-        require_uncorrelated_input(system, sampling.interval, loop.controller, noise.filter)
+    if (
+        isinstance(sampling, RegularSampling)
+        and isinstance(noise, Noise)
+        and isinstance(controller, DiscreteController)
+    ):
+        require_uncorrelated_input(system, sampling.mean_interval, controller, noise.filter)
     return estimated
 
 
