@@ -72,7 +72,7 @@ class StatusResult(Result):
         if self.stored is not None:
             found = self.outcomes()
             shown = found.head(LISTED)
-            notes = [f"{one.first}: {one.reason}" for one in shown.itertuples() if one.reason]
+            notes = [f"{id}: {reason}" for id, reason in zip(shown["first"], shown["reason"], strict=True) if reason]
             notes += [f"and {len(found) - LISTED} more"] if len(found) > LISTED else []
             sections.append(Section(frame=shown.drop(columns="reason"), notes=notes))
         if status.left_aside:
@@ -165,10 +165,10 @@ def outcome_frame(stored: Estimates) -> pd.DataFrame:
     return groups.sort_values("estimates", ascending=False, kind="stable", ignore_index=True)
 
 
-def _categories(texts: Any) -> pd.Categorical:
+def _categories(texts: Any) -> Any:
     """Return texts of few different values in little memory."""
     labels, codes = np.unique(texts, return_inverse=True)
-    return pd.Categorical.from_codes(codes, [label.decode() for label in labels.tolist()])
+    return pd.Categorical.from_codes(codes, pd.Index([label.decode() for label in labels.tolist()]))
 
 
 # --- precision ------------------------------------------------------------------------------------------------------

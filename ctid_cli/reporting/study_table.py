@@ -153,8 +153,8 @@ def study_frame(study: Study, table: StudyTable, found: Mapping[str, Results]) -
         # Estimates without a start are in the tables of fixed and of random starts.
         ours = pd.concat(own, ignore_index=True).drop(columns="published_percent")
         ours = ours[ours["initial_delay"].isna() | ((ours["initial_delay"] == "random") == random)]
-        others = ours.merge(table.published, on=keys, how="left")
-        cells = [table.published.merge(ours, on=keys, how="left"), others[others["published_percent"].isna()]]
+        all_run = ours.merge(table.published, on=keys, how="left")
+        cells = [table.published.merge(ours, on=keys, how="left"), all_run[all_run["published_percent"].isna()]]
     frame = pd.concat([each for each in cells if len(each)], ignore_index=True)
     frame["table"] = table.number
     frame["sampling"] = frame["experiment"].map({name: one["sampling"] for name, one in study.experiments.items()})

@@ -362,7 +362,7 @@ def _parts(stored: Estimates) -> dict[str, dict[str, int]]:
     for column in columns.COLUMNS:
         name, places = column.name, dict[str, int]()
         if column.type == "by name" and stored.has(name):
-            there = stored.column(f"{name}_present").any(axis=0)
+            there: Any = stored.column(f"{name}_present").any(axis=0)
             places = {part: k for k, part in enumerate(stored.export.parts(name)) if there[k]}
         elif column.type == "coefficients" and stored.has(name):
             # The leading 1 of a denominator is left out.

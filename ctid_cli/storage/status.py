@@ -159,10 +159,18 @@ def _status(folder: Path, log: JournalReader | None, running: dict[str, Any] | N
         swept = {**cell["swept"], **estimator["swept"]}
         planned = len(replicates) * len(estimator["starts"])
         groups.append(GroupStatus(planned, len(own), sum(own), estimator["name"], cell["hash"], swept))
-    counts = (sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed"))
+    counts = {name: sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed")}
     part = shard_of(manifest)
-    shard = None if part is None else (part.number, part.of)
-    return ExperimentStatus(*counts, manifest["experiment"], folder, left_aside, mixed, running, tuple(groups), shard)
+    return ExperimentStatus(
+        **counts,
+        experiment=manifest["experiment"],
+        folder=folder,
+        left_aside=left_aside,
+        mixed=mixed,
+        running=running,
+        groups=tuple(groups),
+        shard=None if part is None else (part.number, part.of),
+    )
 
 
 State = Literal["intact", "damaged", "missing", "stale", "left over"]
