@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-import threading
 import time
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, Self
 
 import typer
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 LINE_EVERY = 10.0
 #: Seconds before the bar of a single record appears: most finish sooner.
 BAR_AFTER = 1.0
-#: Seconds before a fit shows its elapsed time.
-TIME_AFTER = 2.0
 
 
 class _Progress:
@@ -42,17 +40,12 @@ class _Progress:
             self._bar.stop()
 
     def _start(self, total: int, *columns: ProgressColumn, **fields: Any) -> None:
-        from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
         shown = (TextColumn("{task.description}"), BarColumn(bar_width=20), *columns, TimeRemainingColumn())
-        self._show(self.name.rpartition("/")[2], *shown, total=total, **fields)
-
-    def _show(self, text: str, *columns: ProgressColumn, transient: bool = False, **fields: Any) -> None:
-        from rich.console import Console
-        from rich.progress import Progress
-
-        self._bar = Progress(*columns, console=Console(stderr=True), transient=transient)
-        self._task = self._bar.add_task(text, **fields)
+        self._bar = Progress(*shown, console=Console(stderr=True))
+        self._task = self._bar.add_task(self.name.rpartition("/")[2], total=total, **fields)
         self._bar.start()
 
     def _update(self, done: int, **fields: Any) -> None:
@@ -93,39 +86,28 @@ class RecordProgress(_Progress):
 
 
 class FitProgress(RecordProgress):
-    """Elapsed time of a fit, on a terminal and if it takes long; then the draws of a bootstrap."""
+    """Shows on a terminal that a fit is computed; then the draws of a bootstrap."""
 
     def __init__(self, samples: int) -> None:
         super().__init__("bootstrap", "the draws")
         self._fitting = f"fitting {count(samples, 'sample')}"
-        self._timer = threading.Timer(TIME_AFTER, self._show_time)
+        self._shown = ExitStack()
 
     def __enter__(self) -> Self:
         if sys.stderr.isatty():
-            self._timer.start()
+            from rich.console import Console
+
+            self._shown.enter_context(Console(stderr=True).status(self._fitting))
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._stop_time()
+        self._shown.close()
+        super().__exit__()
 
     def __call__(self, done: int, total: int) -> None:
         """Show the number of draws done."""
-        if done == 1:
-            self._stop_time()
+        self._shown.close()
         super().__call__(done, total)
-
-    def _show_time(self) -> None:
-        from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
-
-        shown = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-        self._show(self._fitting, *shown, transient=True)
-
-    def _stop_time(self) -> None:
-        self._timer.cancel()
-        if self._timer.ident is not None:
-            self._timer.join()
-        super().__exit__()
-        self._bar = None
 
 
 class Reporter(_Progress):

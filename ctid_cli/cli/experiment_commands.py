@@ -42,15 +42,14 @@ from ctid_cli.text import count, did_you_mean, listed
 if TYPE_CHECKING:
     from ctid_cli.running.engine import RunSummary
     from ctid_cli.running.plan import Plan
-    from ctid_cli.running.states import Workload
     from ctid_cli.storage.manifest import Shard
 
 
 #: Reasons why a run ended early; signals have their names.
 _STOPPED = {
     "time budget": "stopped at the end of the time budget",
-    "failures": "stopped because estimates failed, as was asked for",
-    "machine": "stopped because the machine did not let estimates finish",
+    "failures": "stopped at the number of failures that --max-failures allows",
+    "machine": "stopped because this machine could not finish all estimates",
 }
 #: Most changed settings that are listed.
 CHANGES = 3
@@ -61,13 +60,8 @@ Dask = Annotated[
 ]
 
 
-class Failure(StrEnum):
-    """How a stored estimate failed."""
-
-    failed = "failed"
-    timeout = "timeout"
-    crashed = "crashed"
-    memory = "memory"
+#: How a stored estimate failed.
+Failure = StrEnum("Failure", ["failed", "timeout", "crashed", "memory"])
 
 
 @dataclass(frozen=True)
@@ -162,15 +156,18 @@ def run(
     the file, or for example --set limits.wall_seconds=600, ends single estimates that take too much.
     """
     from ctid_cli.running.engine import preview
+    from ctid_cli.storage.manifest import Shard
 
     if place.keep_readable and not place.fresh:
         raise UsageError("--keep-readable goes with --fresh")
-    plans, part = _parts([plan for _, plan in spec.plans(configs, runs)], shard)
+    plans, part = [plan for _, plan in spec.plans(configs, runs)], None if shard is None else Shard.read(shard)
+    if part is not None:
+        plans = [plan.part(part) for plan in plans]
     folders = [place.out / (plan.experiment if part is None else part.folder(plan.experiment)) for plan in plans]
     require_within(place.out, *folders)
     if dry_run:
         for plan, folder in zip(plans, folders, strict=True):
-            typer.echo(f"{plan.experiment}: {_intention(preview(plan, folder, **place.treatment), folder)}")
+            typer.echo(f"{plan.experiment}, into {folder}: {preview(plan, folder, **place.treatment)}")
         return
     # Imported objects stay: scanning them for garbage again and again takes a tenth of exporting many estimates.
     gc.freeze()
@@ -180,14 +177,6 @@ def run(
     ]
     if failed:
         raise TooManyFailuresError("\n".join(failed))
-
-
-def _parts(plans: list[Plan], shard: str | None) -> tuple[list[Plan], Shard | None]:
-    """Return plans, or the part of each that one of several shards computes."""
-    from ctid_cli.storage.manifest import Shard
-
-    part = None if shard is None else Shard.read(shard)
-    return (plans, None) if part is None else ([plan.part(part) for plan in plans], part)
 
 
 def _run_all(
@@ -223,15 +212,6 @@ def _run_all(
     return summaries
 
 
-def _intention(work: Workload, folder: Path) -> str:
-    text = f"would compute {count(work.estimates, 'estimate')} of "
-    text += f"{count(work.data_sets, 'data set')} into {folder}; {work.reused} are already stored"
-    text += f", {work.again} failed ones are tried again" if work.again else ""
-    text += f", {work.left_aside} stored ones set aside" if work.left_aside else ""
-    more = f"; then in blocks until they are enough, {work.at_most} data sets of a cell at most"
-    return text + more if work.at_most is not None and work.estimates else text
-
-
 def _conclusion(summary: RunSummary, out: Path, part: Shard | None) -> str:
     from ctid_cli.reporting.results import out_option
     from ctid_cli.reporting.status_result import precision_sentence
@@ -243,7 +223,7 @@ def _conclusion(summary: RunSummary, out: Path, part: Shard | None) -> str:
     if summary.moved_aside is not None:
         lines.append(f"  older results are now in {summary.moved_aside}")
     if summary.mixed:
-        lines.append("  they mix code versions or processors, which tables will say")
+        lines.append("  they mix code versions or processors, which tables note")
     if precision := precision_sentence(summary.precision):
         lines.append(f"  {precision}")
     if summary.failed:

@@ -104,9 +104,20 @@ def _require_whole(studies: Sequence[Study]) -> None:
 
 
 def _list(studies: Sequence[Study], form: FormatOptions) -> None:
-    from ctid_cli.studies.catalogue import StudyList
+    """Print the subject of each study, and the experiments of all."""
+    import pandas as pd
 
-    emit(StudyList(studies), form.form)
+    from ctid_cli.reporting.document import Section
+    from ctid_cli.reporting.table_result import TableResult
+
+    rows = [
+        {"study": study.name, "experiment": experiment, "specification": config}
+        for study in studies
+        for experiment, config in study.configs.items()
+    ]
+    titles = [f"- {study.name}: {study.title}" for study in studies]
+    table = pd.DataFrame(rows).drop(columns="study")
+    emit(TableResult(rows, [Section("", titles, table, notes=["Specifications are in configs."])]), form.form)
 
 
 def _check(studies: Sequence[Study], out: Path, form: FormatOptions) -> None:

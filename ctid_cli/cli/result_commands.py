@@ -19,7 +19,7 @@ def status(
 ) -> None:
     """Show stored, missing and failed estimates.
 
-    Of all experiments, one line each. Of one: by estimator and data, how the estimates ended, and the first failures.
+    Of all experiments, one line each. Of one: by estimator and data, and how the estimates ended.
     """
     from ctid_cli.reporting.results import experiments_in, read_results
     from ctid_cli.reporting.status_result import Overview, StatusResult
@@ -109,7 +109,7 @@ def export(
     """Write the estimates of an experiment, or a fit as code.
 
     Every estimate in one row, one of them in full (--id), or the model of a fit as code for another tool (--as).
-    `ctid status EXPERIMENT` lists the identifiers of failed estimates.
+    `ctid status EXPERIMENT` has the identifier of an estimate of each outcome.
     """
     form = "json" if json else format
     if name is not None and name.endswith(".json"):

@@ -1,8 +1,7 @@
 """Paired comparison of two estimators on the same data sets: differences and their significance."""
 
-from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -152,27 +151,3 @@ def fisher(converged: int, n: int, reference_converged: int, reference_n: int) -
 
     reference = [reference_converged, reference_n - reference_converged]
     return float(fisher_exact([reference, [converged, n - converged]]).pvalue)
-
-
-def smallest_detectable(
-    n: int, reference_converged: int, reference_n: int, level: float, *, rise: bool = True, power: float = 0.8
-) -> float | None:
-    """Return the smallest difference from a reference that n data sets detect with a power [percentage points].
-
-    The reference is given. Successes of the n data sets are binomial with probability q; if k or fewer are significant
-    at the level, the drop is to the q with P(K <= k) = 0.8. A rise of successes is a drop of failures. None if not even
-    0 and n successes are significant.
-    """
-    from scipy.stats import beta
-
-    drops = []
-    for expected in (reference_converged, reference_n - reference_converged)[: 1 + rise]:
-        insignificant = partial(_agrees, n, expected, reference_n, level)
-        low = bisect_left(range(n * expected // reference_n + 1), True, key=insignificant) - 1
-        if 0 <= low < n:
-            drops.append(100 * (expected / reference_n - float(beta.ppf(1 - power, low + 1, n - low))))
-    return min(drops, default=None)
-
-
-def _agrees(n: int, expected: int, reference_n: int, level: float, converged: int) -> bool:
-    return fisher(converged, n, expected, reference_n) >= level

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
@@ -18,7 +19,14 @@ from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name, mea
 from ctid_cli.storage.estimates import as_object
 
 if TYPE_CHECKING:
-    from ctid_cli.storage.status import FoundEstimate
+    from ctid_cli.storage.estimates import Estimates
+    from ctid_cli.storage.manifest import Slot
+
+#: Meaning of the names of parameters.
+NAMES = (
+    "a1, b0: one fraction, monic denominator, descending powers. g1_a2: coefficient of p^2 in the denominator of the "
+    "slowest submodel, which ends in 1."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,30 +35,40 @@ class EstimateResult(Result):
 
     schema = "ctid-estimate-1"
 
-    found: FoundEstimate
+    #: This estimate only.
+    stored: Estimates
+
+    @cached_property
+    def row(self) -> dict[str, Any]:
+        """All that is stored of it."""
+        return next(self.stored.rows())
+
+    @cached_property
+    def slot(self) -> Slot:
+        """Its place in the plan."""
+        return self.stored.slot(0)
 
     @property
     def parameters(self) -> list[UncertainValue]:
         """Parameters with their uncertainty."""
-        estimator = self.found.slot.estimator
+        estimator = self.slot.estimator
         # A custom estimator may use the name for something else.
         ours = estimator["kind"] in KINDS["estimator"]
-        return parameters(self.found.row, estimator["content"].get("delay_bounds") if ours else None)
+        return parameters(self.row, estimator["content"].get("delay_bounds") if ours else None)
 
     def content(self) -> dict[str, Any]:
         """Return the estimate for JSON, with its parameters, data and settings."""
-        manifest = self.found.stored.manifest
-        return as_object(self.found.row) | {
+        return as_object(self.row) | {
             "parameters": parameter_rows(self.parameters),
-            "data": self.found.slot.cell["content"],
-            "settings": self.found.slot.estimator["content"],
-            "seed": manifest["seed"],
-            "origins": [origin._asdict() for origin in self.found.stored.origins],
+            "data": self.slot.cell["content"],
+            "settings": self.slot.estimator["content"],
+            "seed": self.stored.manifest["seed"],
+            "origins": [origin._asdict() for origin in self.stored.origins],
         }
 
     def sections(self) -> list[Section]:
         """Return identification, numbers, data and settings of the estimate."""
-        row, seed = self.found.row, self.found.stored.manifest["seed"]
+        row, seed = self.row, self.stored.manifest["seed"]
         head = [f"{row['estimator']} ({row['kind']}), data set {row['replicate']}{_start(row)}"]
         head.append(f"{row['status']}: {row['message']}")
         if row.get("converged") is not None:
@@ -63,23 +81,22 @@ class EstimateResult(Result):
         return [
             Section(f"Estimate {row['id']} of {row['experiment']}", head),
             *numbers,
-            Section(data, _settings(self.found.slot.cell["content"])),
-            Section("Estimator", _settings(self.found.slot.estimator["content"])),
+            Section(data, _settings(self.slot.cell["content"])),
+            Section("Estimator", _settings(self.slot.estimator["content"])),
         ]
 
     def to_frame(self) -> pd.DataFrame:
         """Return one row for each parameter, or measure of frequencies."""
-        rows = _measures(self.found.row) if "measures" in self.found.row else parameter_rows(self.parameters)
+        rows = _measures(self.row) if "measures" in self.row else parameter_rows(self.parameters)
         return pd.DataFrame(rows)
 
     def _fitted(self) -> Section:
         """Return the parameters of a model, and the meaning of their names and intervals."""
-        row, names = self.found.row, [item.name for item in self.parameters]
+        row = self.row
         notes = [f"True delay: {number(row['true_delay'])} s."] if row.get("true_delay") is not None else []
-        if not names:
+        if not self.parameters:
             return Section(notes=notes)
-        meaning = " ".join([*_conventions(names), _interval(row)])
-        return Section.table(self.parameters, PARAMETER, notes=[meaning, *notes])
+        return Section.table(self.parameters, PARAMETER, notes=[f"{NAMES} {_interval(row)}", *notes])
 
 
 def _facts(row: Mapping[str, Any]) -> Section:
@@ -131,16 +148,6 @@ def _interval(row: Mapping[str, Any]) -> str:
     noise = "white" if formula == "white" else "coloured"
     how = "bootstrap-t" if formula == "bootstrap" else f"t, {number(freedom, 4)} degrees of freedom"
     return f"{text} ({how}); errors are those for {noise} noise."
-
-
-def _conventions(names: list[str]) -> list[str]:
-    """Return the meaning of the names of parameters."""
-    if not any(name.startswith("g") for name in names):
-        return ["Monic denominator, descending powers."]
-    lines = ["g1: submodel of the least natural frequency; g1_a2: coefficient of p^2 in its denominator (ends in 1)."]
-    if "a1" in names:
-        lines.append("a1, b0: all submodels as one fraction with a monic denominator, descending powers.")
-    return lines
 
 
 def _start(row: Mapping[str, Any]) -> str:

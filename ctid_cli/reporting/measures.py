@@ -37,9 +37,8 @@ from ctid_cli.running.theory import least_variances
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name
 from ctid_cli.storage.columns import COUNTS, OF_MEASURES, reserved_names
 from ctid_cli.storage.estimates import CLOCKS
-from ctid_cli.storage.groups import places_of
+from ctid_cli.storage.estimation_errors import distances, places_of, pole_errors, system_of
 from ctid_cli.storage.manifest import is_of_signal, true_values
-from ctid_cli.storage.model_errors import distances, pole_errors, system_of
 from ctid_cli.storage.truth import coefficients_of
 from ctid_cli.text import did_you_mean, listed
 
@@ -235,8 +234,8 @@ def values_of(results: Results, name: str, measure: Measure) -> pd.DataFrame:
                 values[numbers == group] = distances(system, results.members(group), name)
         case "converged":
             # A group with an estimate to which no rule applies is left out.
-            judged = pd.Series(stored.judged)
-            values = judged.mask(judged.isna().groupby(numbers).transform("any")).to_numpy()
+            satisfied = pd.Series(stored.satisfied)
+            values = satisfied.mask(satisfied.isna().groupby(numbers).transform("any")).to_numpy()
         case "measures":
             # With several tones the last one to settle counts; one that never settles is later than all others.
             measured = map(str, results.tracks)
@@ -285,16 +284,16 @@ def measure_of(name: str, results: Results) -> Measure:
     return requested(name, custom)
 
 
-def asked_measures(results: Results) -> list[str]:
+def requested_measures(results: Results) -> list[str]:
     """Return the names of the measures in the specification."""
     return [one if isinstance(one, str) else one["name"] for one in results.settings.get("measures") or ()]
 
 
 def default_measures(results: Results) -> Sequence[str]:
     """Return the measures of the specification; without a success rule bias and RMSE; else nothing."""
-    asked = asked_measures(results)
+    named = requested_measures(results)
     measurable = not results.settings.get("success") and results.is_simulated
-    return asked or (DEFAULT if measurable else ())
+    return named or (DEFAULT if measurable else ())
 
 
 def _require_measurable(name: str, results: Results) -> None:
@@ -311,7 +310,7 @@ def _require_measurable(name: str, results: Results) -> None:
     if measure.source == "converged" and not results.settings.get("success"):
         reason = "needs a rule by which an estimate counts as converged, and the specification has no success section"
         raise UsageError(f"{where}: {name} {reason}; use {', '.join(DEFAULT)}")
-    if name == "fresh_fit" and name not in asked_measures(results):
+    if name == "fresh_fit" and name not in requested_measures(results):
         advice = "add 'measures: [fresh_fit]' to the specification, and run it again"
         raise UsageError(f"{where}: {name} is computed while the experiment runs; {advice}")
 

@@ -14,8 +14,8 @@ from ctid_cli.arrays import IndexArray
 from ctid_cli.errors import UsageError
 from ctid_cli.running.theory import readable_plan
 from ctid_cli.storage.estimates import Estimates, read_stored
+from ctid_cli.storage.estimation_errors import error_frame, group_numbers, places_of, planned_groups
 from ctid_cli.storage.folder import experiment_folders
-from ctid_cli.storage.groups import error_frame, group_numbers, places_of, planned_groups
 from ctid_cli.storage.manifest import Manifest, true_values
 from ctid_cli.text import did_you_mean
 

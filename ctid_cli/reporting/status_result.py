@@ -13,8 +13,8 @@ import pandas as pd
 from ctid_cli.inference.monte_carlo import CellPrecision, Widest
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.layout import number, picked, rate
+from ctid_cli.reporting.measures import SUCCESSES
 from ctid_cli.reporting.results import out_option
-from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.status import ExperimentStatus
 from ctid_cli.text import count
 
@@ -23,10 +23,8 @@ if TYPE_CHECKING:
     from ctid_cli.storage.merge import Merged
     from ctid_cli.storage.status import Verification
 
-#: Most failed estimates that texts list.
-LISTED = 10
-#: Columns of failed estimates.
-OF_FAILURES = ("id", "estimator", "replicate", "start", "message")
+#: Most outcomes that texts list.
+LISTED = 20
 MIXED = "mixes code versions or processors"
 _STATES = {"enough": "precise enough", "open": "goes on", "at_most": "at_most reached"}
 
@@ -36,7 +34,7 @@ _STATES = {"enough": "precise enough", "open": "goes on", "at_most": "at_most re
 
 @dataclass(frozen=True, eq=False)
 class StatusResult(Result):
-    """Progress of one experiment, precision of its measures, and failures."""
+    """Progress of one experiment, precision of its measures, and outcomes."""
 
     schema = "ctid-status-1"
 
@@ -60,7 +58,7 @@ class StatusResult(Result):
         return "; ".join([*running, *([MIXED] if status.mixed else [])])
 
     def sections(self) -> list[Section]:
-        """Return counts by estimator and data, precisions, outcomes, and the first failures."""
+        """Return counts by estimator and data, precisions, and outcomes."""
         status = self.status
         head = f"{self.name} in {status.folder}: {status.done} of {status.planned} estimates done"
         sections = [Section(sentences=[head + (f" ({self.remark})" if self.remark else "")])]
@@ -73,40 +71,20 @@ class StatusResult(Result):
         sections += [Section(frame=precision_frame(self.precision))] if self.precision else []
         if self.stored is not None:
             found = self.outcomes()
-            messages = zip(found["status"], found["message"], strict=True)
-            notes = [f"{status}: {message}" for status, message in messages if message]
-            sections += [Section(frame=found[["status", "estimates"]], notes=notes), *self._failed()]
+            shown = found.head(LISTED)
+            notes = [f"{id}: {reason}" for id, reason in zip(shown["first"], shown["reason"], strict=True) if reason]
+            notes += [f"and {len(found) - LISTED} more"] if len(found) > LISTED else []
+            sections.append(Section(frame=shown.drop(columns="reason"), notes=notes))
         if status.left_aside:
-            aside = f"{status.left_aside} stored estimates are set aside: the latest run asked for others."
+            aside = f"{status.left_aside} stored estimates are set aside: the latest run has other settings."
             aside += " To see them, run their specification again; nothing is computed anew."
             sections.append(Section(sentences=[aside]))
         return [*sections, Section(sentences=self._next())]
 
     def outcomes(self) -> pd.DataFrame:
-        """Return the number of estimates of each outcome, with the first message; those of failures differ."""
+        """Return the number of estimates of each estimator, status and reason."""
         assert self.stored is not None
-        found = np.unique(self.stored.column("status"), return_index=True, return_counts=True)
-        rows = []
-        for status, first, n in zip(*(part.tolist() for part in found), strict=True):
-            failed = status.decode() in FAILURES
-            message = "" if failed else first_line(self.stored.part(first, first + 1).values("message")[0])
-            rows.append({"status": status.decode(), "estimates": n, "message": message})
-        return pd.DataFrame(rows).sort_values("estimates", ascending=False, kind="stable")
-
-    def failures(self) -> pd.DataFrame:
-        """Return the first estimates that failed."""
-        assert self.stored is not None
-        places = np.flatnonzero(self.stored.failures)[:LISTED].tolist()
-        rows = [next(self.stored.part(place, place + 1).rows(*OF_FAILURES)) for place in places]
-        frame = pd.DataFrame(rows, columns=OF_FAILURES)
-        return frame.assign(message=frame["message"].map(first_line))
-
-    def _failed(self) -> list[Section]:
-        """Return a list of the first estimates that failed."""
-        rows, n = self.failures().to_numpy().tolist(), self.status.failed
-        lines = [f"- {id}, {by}, data set {number}, start {start}: {said}" for id, by, number, start, said in rows]
-        more = [f"and {n - LISTED} more"] if n > LISTED else []
-        return [Section("Failed estimates:", [*lines, *more])] if n else []
+        return outcome_frame(self.stored)
 
     def _next(self) -> list[str]:
         """Return the suggested next steps."""
@@ -118,7 +96,7 @@ class StatusResult(Result):
         return [f"Next: {command}"] if status.done else []
 
     def content(self) -> dict[str, Any]:
-        """Return progress, outcomes and the first failures for JSON."""
+        """Return progress, precision and outcomes for JSON."""
         status = self.status
         content = asdict(status) | {"folder": str(status.folder), "todo": status.todo}
         before, after = ("estimator", "cell"), ("planned", "done", "todo", "failed")
@@ -127,7 +105,6 @@ class StatusResult(Result):
             content["precision"] = [asdict(cell) for cell in self.precision]
         if self.stored is not None:
             content["outcomes"] = self.outcomes().to_dict("records")
-            content["failures"] = self.failures().to_dict("records")
         return content
 
 
@@ -173,9 +150,25 @@ def _running(progress: Mapping[str, Any]) -> str:
     return ", ".join(words)
 
 
-def first_line(message: str | None) -> str:
-    """Return the first line of an outcome; a failure's message continues with places in the code."""
-    return (message or "").split("\n", 1)[0]
+def outcome_frame(stored: Estimates) -> pd.DataFrame:
+    """Return the number of estimates of each estimator, status and reason, and the id of the first of them.
+
+    The reason is the first line of the message, which continues with places in the code; successes have none.
+    """
+    frame = pd.DataFrame({name: _categories(stored.column(name)) for name in ("estimator", "status")}).assign(reason="")
+    failed = ~frame["status"].isin(SUCCESSES).to_numpy()
+    frame.loc[failed, "reason"] = [text.partition("\n")[0] for text in stored.chosen(failed).values("message")]
+    by = frame.reset_index().groupby(["estimator", "status", "reason"], sort=False, observed=True)["index"]
+    groups = by.agg(estimates="size", first="first").reset_index()
+    groups["first"] = np.char.decode(stored.column("id")[groups["first"]])
+    groups = groups.astype({"estimator": "str", "status": "str"})
+    return groups.sort_values("estimates", ascending=False, kind="stable", ignore_index=True)
+
+
+def _categories(texts: Any) -> Any:
+    """Return texts of few different values in little memory."""
+    labels, codes = np.unique(texts, return_inverse=True)
+    return pd.Categorical.from_codes(codes, pd.Index([label.decode() for label in labels.tolist()]))
 
 
 # --- precision ------------------------------------------------------------------------------------------------------
@@ -185,9 +178,10 @@ def precision_frame(cells: Sequence[CellPrecision]) -> pd.DataFrame:
     """Return every data cell with its widest interval."""
     rows = []
     for cell in cells:
-        widest = (_measure(cell.widest), _width(cell.widest), _asked(cell.widest)) if cell.widest else ("-", "-", "-")
+        one = cell.widest
+        widest = (_measure(one), _width(one), _required(one)) if one else ("-", "-", "-")
         counts = {"data sets": cell.finished, "needed": cell.needed}
-        shown = dict(zip(("widest interval", "half-width", "asked"), widest, strict=True))
+        shown = dict(zip(("widest interval", "half-width", "required"), widest, strict=True))
         rows.append({**cell.swept, **counts, **shown, "": _STATES[cell.state]})
     return pd.DataFrame(rows)
 
@@ -207,7 +201,7 @@ def precision_sentence(cells: Sequence[CellPrecision]) -> str:
         ended = f"{missed} of {len(cells)} data cells ended at {max(sizes)} data sets with wider intervals"
         return f"{ended}, which ctid status lists"
     several = " to ".join(dict.fromkeys((str(min(sizes)), str(max(sizes)))))
-    return f"{several} data sets in each data cell: all intervals are as narrow as asked for"
+    return f"{several} data sets in each data cell: all intervals are as narrow as requested"
 
 
 def _measure(widest: Widest) -> str:
@@ -221,7 +215,7 @@ def _width(widest: Widest) -> str:
     return "not known" if widest.half_width is None else _with_unit(widest.half_width, widest)
 
 
-def _asked(widest: Widest) -> str:
+def _required(widest: Widest) -> str:
     return _with_unit(widest.asked, widest)
 
 
@@ -268,7 +262,7 @@ class MergeResult(Result):
         merged = self.merged
         head = f"{merged.experiment}: {merged.stored} of {merged.planned} estimates in {merged.folder}"
         lines = [f"{head} ({merged.new} new, from {merged.sources} folders)"]
-        lines += [f"  they {MIXED.replace('mixes', 'mix')}, which tables will say"] if merged.mixed else []
+        lines += [f"  they {MIXED.replace('mixes', 'mix')}, which tables note"] if merged.mixed else []
         lines += [f"  {merged.missing}"] if merged.missing else []
         lines.append(f"  next: ctid table {merged.experiment}{out_option(self.out)}")
         return [Section(lines=lines)]

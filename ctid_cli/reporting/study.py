@@ -70,9 +70,8 @@ class Study:
     #: What the percentages of its tables count, and the number of data sets of the published ones.
     success: str = ""
     published_data_sets: int = 0
-    #: Description of each method, and methods that must reach the published percentages.
+    #: Description of each method.
     methods: Mapping[str, str] = field(default_factory=dict)
-    must_reach: Sequence[str] = ()
     #: Key path in a specification of every setting that is a column of the tables.
     fields: Mapping[str, str] = field(default_factory=dict)
     printed_tables: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)

@@ -153,8 +153,8 @@ def study_frame(study: Study, table: StudyTable, found: Mapping[str, Results]) -
         # Estimates without a start are in the tables of fixed and of random starts.
         ours = pd.concat(own, ignore_index=True).drop(columns="published_percent")
         ours = ours[ours["initial_delay"].isna() | ((ours["initial_delay"] == "random") == random)]
-        beside = ours.merge(table.published, on=keys, how="left")
-        cells = [table.published.merge(ours, on=keys, how="left"), beside[beside["published_percent"].isna()]]
+        all_run = ours.merge(table.published, on=keys, how="left")
+        cells = [table.published.merge(ours, on=keys, how="left"), all_run[all_run["published_percent"].isna()]]
     frame = pd.concat([each for each in cells if len(each)], ignore_index=True)
     frame["table"] = table.number
     frame["sampling"] = frame["experiment"].map({name: one["sampling"] for name, one in study.experiments.items()})
@@ -281,16 +281,9 @@ def read_tables(file: Path) -> pd.DataFrame:
     frame: pd.DataFrame = pd.read_csv(file, dtype="str")
     texts = ["experiment", "sampling", "method", "initial_delay"]
     frame = frame.astype(dict.fromkeys(frame.columns.difference(texts), "float64"))
-    frame["initial_delay"] = frame["initial_delay"].astype(object).map(_initial_delay, na_action="ignore")
+    delays = pd.to_numeric(frame["initial_delay"], errors="coerce").astype(object)
+    frame["initial_delay"] = delays.where(delays.notna(), frame["initial_delay"])
     return frame.astype(dict.fromkeys(("table", "n", "failed"), "int64") | {"converged": "Int64"})
-
-
-def _initial_delay(text: str) -> float | str:
-    """Return an initial delay of a table, a number or a word."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def environment_of(published: Path) -> dict[str, Any] | None:

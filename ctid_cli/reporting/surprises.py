@@ -18,7 +18,7 @@ from ctid_cli.reporting.measures import Row, counted_in, label_frame, measure_fr
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.simulation.expected_accuracy import why_biased
-from ctid_cli.specification.joint_warnings import joint_warnings
+from ctid_cli.specification.joint_checks import joint_warnings
 
 #: Probability of a sentence about an experiment that agrees with theory.
 LEVEL = 0.05

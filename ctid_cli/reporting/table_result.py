@@ -101,22 +101,14 @@ def joined(tables: Sequence[TableResult]) -> TableResult:
 
 def labels_of(frame: pd.DataFrame, *others: str, options: Sequence[str] = ()) -> pd.DataFrame:
     """Return the identifying columns as text: swept fields but ``options``, starts, and other keys that any row has."""
-    keys = [key for key in settings_of(frame) if key not in options]
-    texts = {setting_title(key): [setting_text(key, value) for value in frame[key]] for key in keys if _has(frame, key)}
-    if _has(frame, "initial_delay"):
-        texts["initial delay"] = [
-            delay_label(None if _is_missing(value) else value) for value in frame["initial_delay"]
-        ]
-    texts |= {key: [number(value) for value in frame[key]] for key in others if _has(frame, key)}
+    known = frame.loc[:, frame.notna().any()].astype(object)
+    known = known.where(known.notna(), None)
+    keys = [key for key in settings_of(known) if key not in options]
+    texts = {setting_title(key): [setting_text(key, value) for value in known[key]] for key in keys}
+    if "initial_delay" in known:
+        texts["initial delay"] = [delay_label(delay) for delay in known["initial_delay"]]
+    texts |= {key: [number(value) for value in known[key]] for key in others if key in known}
     return pd.DataFrame(texts, index=frame.index)
-
-
-def _has(frame: pd.DataFrame, key: str) -> bool:
-    return key in frame and bool(frame[key].notna().any())
-
-
-def _is_missing(value: Any) -> bool:
-    return value is None or value != value
 
 
 def pivot(texts: pd.DataFrame, down: Sequence[str], across: str, shown: Sequence[str], empty: str = "") -> pd.DataFrame:
@@ -129,11 +121,11 @@ def pivot(texts: pd.DataFrame, down: Sequence[str], across: str, shown: Sequence
     return pd.concat([part.reindex(order) for part in parts], axis=1).fillna(empty).reset_index()
 
 
-def cells_of(frame: pd.DataFrame, *, judged: bool = True) -> pd.DataFrame:
+def cells_of(frame: pd.DataFrame, *, rule: bool = True) -> pd.DataFrame:
     """Return percentages, their intervals, counts and times of rows as text; without a rule only the last two."""
     rows = records_of(frame)
-    texts = {"%": [percent_text(row) for row in rows], "95 %": [interval_text(row) for row in rows]} if judged else {}
-    texts["n"] = [str(row["n"]) if judged or row["n"] else NOT_RUN for row in rows]
+    texts = {"%": [percent_text(row) for row in rows], "95 %": [interval_text(row) for row in rows]} if rule else {}
+    texts["n"] = [str(row["n"]) if rule or row["n"] else NOT_RUN for row in rows]
     texts["time"] = [seconds(time_of(row)) if row["n"] else "" for row in rows]
     return pd.DataFrame(texts, index=frame.index)
 
@@ -178,17 +170,17 @@ def experiment_table(results: Results, remarks: Sequence[str] = ()) -> TableResu
     if results.settings.get("data") is not None:
         return TableResult(_with_estimates(results, frame), _record_sections(results), remarks)
     head = Section(results.experiment, [f"Counted: {success_sentence(results.settings)}."])
-    cells = cells_of(frame, judged=bool(results.settings.get("success")))
-    rule = f"{RULE} " if results.settings.get("success") else ""
+    cells = cells_of(frame, rule=bool(results.settings.get("success")))
+    meaning = f"{RULE} " if results.settings.get("success") else ""
     if is_of_signal(results.manifest):
         measured = [key for key in map(str, frame) if key.startswith(OF_FREQUENCIES)]
         texts = {title_of(key): [number(value, 3) for value in frame[key]] for key in measured}
         table = labels_of(frame, "method").join(cells.drop(columns="time")).assign(**texts, time=cells["time"])
         alarms = " alarms: false ones, in all data sets together." if "false_alarms" in frame else ""
-        shown = [Section(frame=table), Section(notes=[f"{rule}{SETTLING}{alarms} {TIME}."])]
+        shown = [Section(frame=table), Section(notes=[f"{meaning}{SETTLING}{alarms} {TIME}."])]
     else:
         tables = [Section(frame=table) for table in _by_estimator(results, frame, cells)]
-        shown = [*tables, Section(notes=[f"{rule}{TIME}."])]
+        shown = [*tables, Section(notes=[f"{meaning}{TIME}."])]
     return TableResult(records_of(frame), [head, *shown], remarks)
 
 
@@ -243,8 +235,8 @@ def measure_table(results: Results, names: Sequence[str], remarks: Sequence[str]
     present = frame[(frame["measure"] != "failures") | (frame["value"] != 0)]
     parts = [part for own in tables.values() if len(part := present[present["measure"].isin(own)])]
     shown = [Section(frame=_measured(part, measures)) for part in parts]
-    told = {name.partition(":")[0]: measure.meaning for name, measure in measures.items()}
-    meanings = "; ".join(f"{name}: {meaning}" for name, meaning in told.items())
+    meant = {name.partition(":")[0]: measure.meaning for name, measure in measures.items()}
+    meanings = "; ".join(f"{name}: {meaning}" for name, meaning in meant.items())
     foot = f"{meanings}. ± is one Monte Carlo standard error, [ ] a 95 % interval; --format csv and json have both."
     if frame["without_value"].any():
         foot += " n: estimates that count; no value: those without what is measured, failed ones among them."
@@ -252,11 +244,11 @@ def measure_table(results: Results, names: Sequence[str], remarks: Sequence[str]
         foot += " Statuses that no estimate ended with are left out."
     squared = frame["measure"].str.partition(":")[0].isin(OF_SQUARES)
     wide = squared & (frame["error"] > WIDE * frame["value"]) & (frame["n"] >= FEW)
-    if wide.any() and "robust_deviation" not in told:
+    if wide.any() and "robust_deviation" not in meant:
         foot += (
             " Where ± exceeds half of the value, few large errors determine it; --measure median_bias,robust_deviation"
         )
-        foot += " tells of the other estimates."
+        foot += " describe the other estimates."
     return TableResult(records_of(frame), [Section(results.experiment), *shown, Section(notes=[foot])], remarks)
 
 

@@ -46,12 +46,12 @@ class DaskWorkers:
             self._client = Client(address, timeout=10, set_as_default=False)  # type: ignore[no-untyped-call]
         except (OSError, ValueError, TimeoutError) as error:
             advice = "start one with: dask scheduler"
-            raise UsageError(f"no scheduler of dask answers at {address} ({error}); {advice}") from None
+            raise UsageError(f"there is no dask scheduler at {address} ({error}); {advice}") from None
         self._expected = packed(origin, computing_parts(plan))
         # Submitted as a task, because data scattered to workers are lost with them.
         self._files = self._client.submit(dict, contents, pure=False)
         self._executor = self._client.get_executor(pure=False)
-        self.count, self.trouble = 1, ""
+        self.count, self.ended_by = 1, ""
         self._looked, self._present = float("-inf"), time.monotonic()
         self._look()
 
@@ -63,7 +63,7 @@ class DaskWorkers:
             try:
                 self.count = len(self._client.nthreads())
             except Exception as error:
-                raise MachineError(f"{self._address} does not answer any more ({error})") from error
+                raise MachineError(f"{self._address} is no longer reachable ({error})") from error
             self._present = now if self.count else self._present
             if now - self._present > PATIENCE:
                 start = f"start some with: dask worker {self._address} --nthreads 1"

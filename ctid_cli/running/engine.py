@@ -21,9 +21,9 @@ from ctid_cli.running.job import Job
 from ctid_cli.running.limits import MACHINE, PATIENCE, TOO_MANY_FAILURES, Limits, StopRequest, advice
 from ctid_cli.running.plan import Plan, current_origin
 from ctid_cli.running.states import States, Workload, as_needed, data_sets, jobs_of, stored_precisions
-from ctid_cli.running.suspects import NAMED, Course
+from ctid_cli.running.suspects import NAMED, JobQueue
 from ctid_cli.running.workers import LocalWorkers
-from ctid_cli.storage import folder as place
+from ctid_cli.storage import folder as folders
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.identity import Origin, now, session_info
@@ -78,7 +78,7 @@ class RunSummary:
     precision: tuple[CellPrecision, ...] = ()
     #: Estimator and replicate of estimates that could not be finished for lack of resources, and the cause.
     given_up: tuple[str, ...] = ()
-    hindrance: str = ""
+    cause: str = ""
 
     @property
     def missing(self) -> int:
@@ -87,19 +87,16 @@ class RunSummary:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of a command: 0 if everything is stored, 130 or 143 after a signal, 5 after another stop.
-
-        8 where the machine stood in the way.
-        """
+        """Exit code: 0 if everything is stored, 130 or 143 after a signal, 8 for lack of resources, else 5."""
         return 0 if self.stopped_by is None else _EXIT_CODES.get(self.stopped_by, STOPPED)
 
     def machine_error(self) -> MachineError:
-        """Return what to say where the machine stood in the way."""
-        text = f"{self.experiment}: the machine did not let estimates finish, {self.missing} are missing"
+        """Return the error of a run that the machine had not the resources to finish."""
+        text = f"{self.experiment}: this machine could not finish all estimates, {self.missing} are missing"
         if self.given_up:
             more = ", …" if len(self.given_up) > NAMED else ""
             text += f" ({', '.join(self.given_up[:NAMED])}{more})"
-        return MachineError(f"{text}: {self.hindrance}. What helps: {advice(self.hindrance)}. The same command goes on")
+        return MachineError(f"{text}: {self.cause}. What helps: {advice(self.cause)}. The same command goes on")
 
 
 def compile_kernels(plan: Plan) -> None:
@@ -154,13 +151,13 @@ def run_experiment(
 
             workers = DaskWorkers(dask, plan, origin, limits)
         stack.callback(workers.close)
-        moved = place.move_aside(folder) if fresh else None
-        with place.writing(folder):
+        moved = folders.move_aside(folder) if fresh else None
+        with folders.writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        stack.enter_context(place.lock(folder))
-        place.check_free(folder, plan.manifest(), None if allow_mixed else origin)
-        place.clear(folder)
-        with place.saying_what_is_safe(folder):
+        stack.enter_context(folders.lock(folder))
+        folders.check_free(folder, plan.manifest(), None if allow_mixed else origin)
+        folders.clear(folder)
+        with folders.with_recovery_advice(folder):
             log = open_journal(folder / FILE_NAME)
         stack.callback(log.close)
         kept = ""
@@ -169,7 +166,7 @@ def run_experiment(
         states, plan = States.read(log, retry, limits), as_needed(plan, log)
         work = states.workload(plan)
         if work.estimates:
-            # Until workers are at work, a signal ends the process as it ends any other.
+            # Until jobs are submitted, a signal ends the process at once.
             warm(plan)
         stack.enter_context(stopping)
         former = log.manifest()["spec"] if states.stored else None
@@ -200,7 +197,7 @@ class _Run:
         self.computed = self.done = self.failures = 0
         self.total = work.data_sets
         self.given_up: list[str] = []
-        self.hindrance = ""
+        self.cause = ""
         self.precision: tuple[CellPrecision, ...] = ()
         #: Number of unfinished estimates of each data set in progress.
         self.unfinished: dict[tuple[str, int], int] = {}
@@ -208,13 +205,13 @@ class _Run:
 
     def start(self, origin: Origin, circumstances: dict[str, Any], kept: str) -> None:
         """Record the start of the run, and report its workload."""
-        with place.writing(self.folder):
+        with folders.writing(self.folder):
             self.log.write_spec(self.plan.spec.text.encode())
         info = session_info(self.plan.spec.text) | circumstances
         self.session = self.log.begin(self.plan.manifest(), origin, self.started, info)
-        self._tell(message=str(self.work))
+        self._report(message=str(self.work))
         if kept:
-            self._tell(message=kept)
+            self._report(message=kept)
 
     def needs_more(self) -> bool:
         """Return whether data cells need more data sets after the finished block; if so, plan their next block."""
@@ -225,37 +222,37 @@ class _Run:
         self.plan = replace(self.plan, replicates=needed)
         self.total = self.done + data_sets(self.states.missing(self.plan))
         self.log.replan(self.plan.manifest())
-        self._tell(precision=self.precision)
+        self._report(precision=self.precision)
         return True
 
     def compute(self, workers: Any, limits: Limits, stopping: StopRequest) -> None:
         """Compute missing estimates, and store and report them in order of arrival."""
         batch: list[Outcome] = []
         since = time.monotonic()
-        told = False
-        course = Course(self._jobs(), workers, limits, stopping, lambda message: self._tell(message=message))
-        with closing(course.outcomes()) as found:
+        announced = False
+        queue = JobQueue(self._jobs(), workers, limits, stopping, lambda message: self._report(message=message))
+        with closing(queue.outcomes()) as found:
             try:
                 for outcomes in found:
-                    if stopping() and not told:
-                        told = True
-                        what = f"{PATIENCE:g} s for what is in work; once more to stop at once"
-                        self._tell(message=f"stopping ({stopping.reason}): {what}")
+                    if stopping() and not announced:
+                        announced = True
+                        what = f"running estimates have {PATIENCE:g} s; a second signal stops at once"
+                        self._report(message=f"stopping ({stopping.reason}): {what}")
                     batch += outcomes
                     if batch and (time.monotonic() - since >= COMMIT_SECONDS or len(batch) >= COMMIT_ESTIMATES):
                         batch = self._commit(batch)
                         since = time.monotonic()
                         if self.failures >= (stopping.failures or math.inf):
-                            stopping.ask(TOO_MANY_FAILURES)
+                            stopping.request(TOO_MANY_FAILURES)
             except (MachineError, RefusedError):
-                # A cluster that is gone does not take with it what it has finished.
+                # Estimates that a lost cluster has finished are stored.
                 self._commit(batch)
                 raise
         self._commit(batch)
-        self.given_up += course.given_up
-        self.hindrance = course.hindrance or self.hindrance
-        if course.hopeless:
-            stopping.ask(MACHINE)
+        self.given_up += queue.given_up
+        self.cause = queue.cause or self.cause
+        if queue.is_stuck:
+            stopping.request(MACHINE)
 
     def _jobs(self) -> Iterator[Job]:
         for job in jobs_of(self.plan, self.states.missing(self.plan)):
@@ -277,10 +274,10 @@ class _Run:
                 del self.unfinished[data_set]
                 self.done += 1
         self.computed += len(batch)
-        self._tell(stored=[outcome.key for outcome in batch])
+        self._report(stored=[outcome.key for outcome in batch])
         return []
 
-    def _tell(self, **what: Any) -> None:
+    def _report(self, **what: Any) -> None:
         counts = self.done, self.total, self.states.stored
         announce(self.folder, self.plan.experiment, self.started, *counts)
         self.progress(Progress(self.done, self.total, self.failures, **what))
@@ -305,7 +302,7 @@ class _Run:
             stopped_by=reason if left.estimates else None,
             precision=self.precision,
             given_up=tuple(self.given_up),
-            hindrance=self.hindrance,
+            cause=self.cause,
         )
 
 
@@ -315,8 +312,8 @@ def preview(
     """Return the workload of a run without computing or writing anything."""
     if fresh or not folder.exists():
         return States().workload(plan)
-    with place.lock(folder, shared=True):
-        place.check_free(folder, plan.manifest(), None if allow_mixed else current_origin(plan))
-        with place.reading_journal(folder) as log:
+    with folders.lock(folder, shared=True):
+        folders.check_free(folder, plan.manifest(), None if allow_mixed else current_origin(plan))
+        with folders.reading_journal(folder) as log:
             states = States.read(log, retry, Limits.of(plan.spec.canonical()))
             return states.workload(as_needed(plan, log))

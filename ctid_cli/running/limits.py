@@ -65,7 +65,7 @@ class Limits:
         return any(old is not None and (new is None or new > old) for old, new in pairs)
 
     def begin(self, watched: BinaryIO, spent: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Set the limits for what this process does next; a wall time that is over is noted in a file."""
+        """Set the limits of the next estimate in this process; exceeding the wall time writes to a file."""
         if self.wall_seconds is not None:
             faulthandler.dump_traceback_later(max(self.wall_seconds - spent[0], _LEAST), exit=True, file=watched)
         if self.cpu_seconds is not None:
@@ -75,7 +75,7 @@ class Limits:
             _limit_memory(_data_bytes() + int(self.memory_mb * _MEGABYTE))
 
     def end(self) -> None:
-        """Take the limits back."""
+        """Remove the limits."""
         if self.wall_seconds is not None:
             faulthandler.cancel_dump_traceback_later()
         if self.cpu_seconds is not None:
@@ -142,17 +142,17 @@ def advice(reason: str) -> str:
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-#: How long a stop waits for what is in work [s].
+#: Time for running jobs to finish after a request to stop [s].
 PATIENCE = 5.0
 #: Reasons that are no signals.
 TIME_BUDGET, TOO_MANY_FAILURES, MACHINE = "time budget", "failures", "machine"
 
 
 class StopRequest:
-    """Notices requests to stop; signals, while it is entered.
+    """A request to stop a run, by a signal, a time budget or a number of failures.
 
-    The first signal is only noted, so that what is in work has a few seconds to be finished and stored. The second ends
-    the process at once, as without a handler; the workers end with it, and the journal is made for that.
+    After the first signal, running jobs have a few seconds to finish and be stored. The second one ends the process at
+    once, as without a handler; the workers end with it, and committed estimates are safe.
     """
 
     def __init__(self, *, failures: int | None = None, seconds: float | None = None) -> None:
@@ -164,7 +164,7 @@ class StopRequest:
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
-        # Python hands signals to the main thread only; elsewhere the owner of the main thread decides.
+        # Python delivers signals to the main thread only.
         if threading.current_thread() is threading.main_thread():
             for number in _SIGNALS:
                 self._before[number] = signal.signal(number, self._note)
@@ -177,27 +177,27 @@ class StopRequest:
             signal.signal(number, handler)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        self.ask(signal.Signals(number).name)
+        self.request(signal.Signals(number).name)
         for each in _SIGNALS:
             signal.signal(each, signal.SIG_DFL)
 
-    def ask(self, reason: str) -> None:
-        """Ask for a stop; the first reason counts."""
+    def request(self, reason: str) -> None:
+        """Request a stop; the first reason is kept."""
         if self._reason is None:
             self._reason, self._since = reason, time.monotonic()
 
     def __call__(self) -> bool:
-        """Return whether a stop was asked for."""
+        """Return whether a stop was requested."""
         return self.reason is not None
 
     @property
     def overdue(self) -> bool:
-        """Whether a stop was asked for so long ago that nothing in work is waited for any more."""
+        """Whether the time to finish running jobs after the request is over."""
         return time.monotonic() > self._since + PATIENCE
 
     @property
     def reason(self) -> str | None:
         """Name of the signal, another reason, or None."""
         if self._deadline is not None and time.monotonic() > self._deadline:
-            self.ask(TIME_BUDGET)
+            self.request(TIME_BUDGET)
         return self._reason

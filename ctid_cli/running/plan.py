@@ -67,7 +67,7 @@ class Plan:
         """Largest number of data sets of any data cell."""
         return max(self.replicates)
 
-    def asked(self, cell: int) -> BoolArray:
+    def requested(self, cell: int) -> BoolArray:
         """Return which replicates of a data cell are requested: all, or those of the shard."""
         own, shard, cells = self.replicates[cell], self.shard, len(self.data_cells)
         if shard is None:
@@ -77,7 +77,7 @@ class Plan:
     @property
     def data_sets(self) -> int:
         """Number of data sets."""
-        return int(sum(self.asked(cell).sum() for cell in range(len(self.data_cells))))
+        return int(sum(self.requested(cell).sum() for cell in range(len(self.data_cells))))
 
     @property
     def estimates_each(self) -> int:
@@ -89,8 +89,8 @@ class Plan:
         section = self.spec.monte_carlo
         if section is not None and section.until is not None:
             raise UsageError(
-                f"{self.experiment}: monte_carlo.until decides on all data sets together, and no shard sees those of "
-                f"the others; give their number, for example --runs {section.most}. After the merge, ctid run without "
+                f"{self.experiment}: monte_carlo.until decides on all data sets together, and a shard has only some "
+                f"of them; give their number, for example --runs {section.most}. After the merge, ctid run without "
                 "--shard and --runs takes as many of them as the precision needs"
             )
         return dataclasses.replace(self, shard=shard)
@@ -114,8 +114,8 @@ class Plan:
     def job(self, cell: int, replicate: int, wanted: BoolArray | None = None) -> Job:
         """Return the job of a data set with the requested estimates; by default all."""
         keys = self.keys(cell, replicate)
-        asked = tuple(keys if wanted is None else itertools.compress(keys, wanted))
-        return Job(self.data_cells[cell], replicate, self.monte_carlo.get("seed"), asked, self.terms)
+        wanted_keys = tuple(keys if wanted is None else itertools.compress(keys, wanted))
+        return Job(self.data_cells[cell], replicate, self.monte_carlo.get("seed"), wanted_keys, self.terms)
 
     @cached_property
     def terms(self) -> tuple[Term, ...] | None:

@@ -18,7 +18,7 @@ from ctid_cli.running.plan import Plan
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.journal import JournalReader
 from ctid_cli.storage.manifest import Key, Manifest, true_values
-from ctid_cli.storage.truth import arrays_of_rows, found_under, judged
+from ctid_cli.storage.truth import arrays_of_rows, found_under, satisfied
 from ctid_cli.text import count
 
 #: States of an estimate: not stored, stored, stored as a failure, and a failure to compute again.
@@ -91,13 +91,13 @@ class States:
     def missing(self, plan: Plan) -> list[BoolArray]:
         """Return the mask of estimates to compute for every data cell, shape (estimates, replicates)."""
         cells = range(len(plan.data_cells))
-        return [np.isin(self._table(plan, cell), _TO_COMPUTE) & plan.asked(cell) for cell in cells]
+        return [np.isin(self._table(plan, cell), _TO_COMPUTE) & plan.requested(cell) for cell in cells]
 
     def workload(self, plan: Plan) -> Workload:
         """Return the numbers of stored estimates of a plan and of those to compute."""
         found = np.zeros(4, dtype=int)
         for cell in range(len(plan.data_cells)):
-            found += np.bincount(self._table(plan, cell)[:, plan.asked(cell)].ravel(), minlength=4)
+            found += np.bincount(self._table(plan, cell)[:, plan.requested(cell)].ravel(), minlength=4)
         absent, stored, failed, again = found.tolist()
         return Workload(
             data_sets=data_sets(self.missing(plan)),
@@ -137,13 +137,13 @@ Found = Mapping[Key, Mapping[str, Any]]
 
 def cell_precisions(manifest: Manifest, found: Found) -> tuple[CellPrecision, ...]:
     """Return the precision of every data cell; empty if the number of data sets is given."""
-    section = _asked(manifest)
+    section = _precision_section(manifest)
     return () if section is None else tuple(_cell(manifest, cell, section, found) for cell in manifest["data_cells"])
 
 
 def stored_precisions(manifest: Manifest, log: JournalReader) -> tuple[CellPrecision, ...]:
     """Return the precision of every data cell from a journal."""
-    if _asked(manifest) is None:
+    if _precision_section(manifest) is None:
         return ()
     return cell_precisions(manifest, {row.key: row.content for row in log.rows()})
 
@@ -154,7 +154,7 @@ def as_needed(plan: Plan, log: JournalReader | None) -> Plan:
     return replace(plan, replicates=tuple(cell.needed for cell in cells)) if cells else plan
 
 
-def _asked(manifest: Manifest) -> Mapping[str, Any] | None:
+def _precision_section(manifest: Manifest) -> Mapping[str, Any] | None:
     """Return the section with the required precision."""
     section: Mapping[str, Any] = manifest["spec"].get("monte_carlo") or {}
     return section if section.get("until") else None
@@ -184,6 +184,6 @@ def _replications(
     arrays = arrays_of_rows(results)
     values = found_under(tuple(truth), arrays, len(results)).values
     # Without a rule or true values, convergence is undefined.
-    hits = judged(success, truth, arrays, values, [row.get("measures") for row in results])
+    hits = satisfied(success, truth, arrays, values, [row.get("measures") for row in results])
     errors = values - np.array([*truth.values()], dtype=float)
     return Replications(hits, errors, tuple(truth), part["name"], part["swept"], start)

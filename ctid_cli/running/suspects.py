@@ -39,7 +39,7 @@ NAMED = 3
 _FROM_OUTSIDE = {"SIGKILL", "SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT", "SIGXCPU", "SIGXFSZ"}
 
 
-class Course:
+class JobQueue:
     """Jobs in progress, from submission to estimates."""
 
     def __init__(
@@ -48,14 +48,14 @@ class Course:
         workers: LocalWorkers | DaskWorkers,
         limits: Limits,
         stopping: StopRequest,
-        tell: Callable[[str], object],
+        report: Callable[[str], object],
     ) -> None:
-        self._jobs, self._workers, self._limits, self._stopping, self._tell = jobs, workers, limits, stopping, tell
+        self._jobs, self._workers, self._limits, self._stopping, self._report = jobs, workers, limits, stopping, report
         #: Estimates that could not be finished for lack of resources, by name, and the cause.
         self.given_up: list[str] = []
-        self.hindrance = ""
+        self.cause = ""
         #: Whether the machine cannot finish any estimate.
-        self.hopeless = False
+        self.is_stuck = False
         #: Remaining jobs of dead processes that are not suspects.
         self._again: deque[Job] = deque()
         self._suspects: list[Job] = []
@@ -63,20 +63,20 @@ class Course:
         self._undecided: list[Job] = []
         self._exhausted = False
         #: Since the last finished estimate: number of exhausted resources, and of rounds.
-        self._short = self._vain = 0
+        self._short = self._idle_rounds = 0
         #: Cause of death of the last process, or exhausted resource.
         self._reason = ""
 
     def outcomes(self) -> Generator[list[Outcome]]:
         """Yield finished estimates; an empty list at intervals."""
         while not self._stopping() and not (self._exhausted and not self._again):
-            self._vain += 1
+            self._idle_rounds += 1
             yield from self._round()
-            if self._vain >= PATIENCE and (self._again or not self._exhausted):
-                self.hopeless = True
-                self.hindrance = self._reason or self._workers.trouble
+            if self._idle_rounds >= PATIENCE and (self._again or not self._exhausted):
+                self.is_stuck = True
+                self.cause = self._reason or self._workers.ended_by
                 return
-            time.sleep(PAUSE * self._vain)
+            time.sleep(PAUSE * self._idle_rounds)
 
     def _round(self) -> Generator[list[Outcome]]:
         """Compute until all jobs are done or a process dies; then compute each suspect alone."""
@@ -87,7 +87,7 @@ class Course:
                 jobs, at_once, tries = self._suspects, self._workers.count, 1
                 self._suspects = []
                 estimates = count(sum(len(job.wanted) for job in jobs), "estimate")
-                self._tell(f"a worker process died; computing {estimates} again, each in a process of its own")
+                self._report(f"a worker process died; computing {estimates} again, each in a process of its own")
             else:
                 jobs, at_once, tries = self._undecided, 1, 2
                 self._undecided = []
@@ -114,12 +114,12 @@ class Course:
         outcomes = [entry for entry in ending.entries if isinstance(entry, Outcome)]
         left = [key for key in job.keys if key not in {outcome.key for outcome in outcomes}]
         if outcomes:
-            self._short = self._vain = 0
+            self._short = self._idle_rounds = 0
         for entry in ending.entries:
             if isinstance(entry, Short):
                 left = [key for key in left if key not in entry.keys]
                 self._short += 1
-                self._hindered(job.only(entry.keys), entry.reason, tries)
+                self._try_again_or_give_up(job.only(entry.keys), entry.reason, tries)
         self._reason = ending.how or self._reason
         in_work = [key for key in ending.begun if key in left] if ending.how else []
         if tries and ending.how and not in_work:
@@ -149,18 +149,18 @@ class Course:
             status = "CRASHED"
             reason = f"the worker process died each time this was computed, the last time alone ({ending.how})"
         else:
-            self._hindered(job, ending.how, tries)
+            self._try_again_or_give_up(job, ending.how, tries)
             return
-        self._vain = 0
+        self._idle_rounds = 0
         yield from (Outcome(key, failed(reason, status), None) for key in job.keys)
 
-    def _hindered(self, job: Job, reason: str, tries: int) -> None:
+    def _try_again_or_give_up(self, job: Job, reason: str, tries: int) -> None:
         """Give up the estimates of a job, or compute it once more."""
         self._reason = reason
         if tries < 2:
             self._undecided.append(job)
             return
-        self.hindrance = reason
+        self.cause = reason
         names = job.names(job.keys)
         self.given_up += names
-        self._tell(f"{count(len(names), 'estimate')} given up, not stored ({', '.join(names[:NAMED])}): {reason}")
+        self._report(f"{count(len(names), 'estimate')} given up, not stored ({', '.join(names[:NAMED])}): {reason}")

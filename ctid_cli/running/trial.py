@@ -1,6 +1,7 @@
 """Trial of a specification: find errors that only its first data sets show, before anything is stored.
 
-The first data set of each setting is simulated, and every estimator prepared on it. Custom components are tried in a
+The first data set of each setting is simulated, and every estimator prepared on it; those that theory says are biased
+get a warning. Custom components are tried in a
 separate process, under limits and twice, with the global random generators in two states: results that differ the
 second time are not reproducible. Custom estimators are also fitted to the first data set. A component that ends its
 process, or takes too long, is left to the run, which stores the failure for every estimate.
@@ -37,7 +38,7 @@ from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource
 from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.joint_checks import MAX_TRIALS
 from ctid_cli.specification.load import load_spec
-from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.messages import Violation
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.sweeps import Failure, Variant, grouped, swept_in, variants
 from ctid_cli.specification.system_sections import start_points
@@ -96,8 +97,8 @@ class Found:
     """Result of a trial."""
 
     #: Errors to correct, and problems that may not occur with other data.
-    wrong: list[Complaint] = field(default_factory=list)
-    odd: list[Complaint] = field(default_factory=list)
+    errors: list[Violation] = field(default_factory=list)
+    warnings: list[Violation] = field(default_factory=list)
 
 
 def try_out(spec: Spec) -> Found:
@@ -166,9 +167,12 @@ def _try_under_limits(limits: Limits, late: Path, *given: Any) -> Found:
 
 def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], success: Mapping[str, Any]) -> Found:
     """Simulate the first data set of each setting, and prepare every estimator on it."""
+    from ctid_cli.simulation.expected_accuracy import why_biased
+
     found, end = Found(), time.monotonic() + MAX_SECONDS
-    #: Problems of the data, and of each estimator by name, with the swept values that were tried.
+    #: Problems of the data, and of each estimator by name, with the swept values that were tried; biased estimators.
     failures: dict[str, list[Failure]] = defaultdict(list)
+    biased: dict[str, list[Failure]] = defaultdict(list)
     tried: dict[str, list[Mapping[KeyPath, Any]]] = defaultdict(list)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
@@ -176,19 +180,22 @@ def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], succe
             if tried and time.monotonic() > end:
                 break
             first = not tried
-            data, complaints = _first_data(setting.cell.source)
+            data, violations = _first_data(setting.cell.source)
             tried[_DATA].append(setting.swept)
-            failures[_DATA] += [(path, text, setting.swept) for path, text in complaints]
+            failures[_DATA] += [(path, text, setting.swept) for path, text in violations]
             for candidate in candidates if data is not None else ():
                 name, swept, unusable = candidate.name, {**setting.swept, **candidate.swept}, ""
                 if not candidate.is_custom:
                     unusable = _unusable(candidate.estimator, data)
                     tried[name].append(swept)
                     failures[name] += [(("estimators", name), unusable, swept)] if unusable else []
+                    why = why_biased(setting.cell.source, candidate.estimator)
+                    biased[name] += [(("estimators", name), f"is biased: {why}", swept)] if why else []
                 if first and not unusable and (candidate.is_custom or setting.cell.measures):
                     _fit(candidate, data, setting, [one.estimator for one in candidates], success, found)
-    for subject, some in failures.items():
-        found.wrong.extend(grouped(some, tried[subject]))
+    for subject in tried:
+        found.errors.extend(grouped(failures[subject], tried[subject]))
+        found.warnings.extend(grouped(biased[subject], tried[subject]))
     return found
 
 
@@ -198,7 +205,7 @@ def _custom_parts(source: Any) -> dict[str, Any]:
     return {place: part for place, part in parts.items() if is_custom(part)}
 
 
-def _first_data(source: Any) -> tuple[Any, list[Complaint]]:
+def _first_data(source: Any) -> tuple[Any, list[Violation]]:
     """Return the first data set of a source; or None, and the problems if its sections cause the error."""
     custom = _custom_parts(source)
     try:
@@ -272,23 +279,23 @@ def _fit(
     try:
         (first, values, reasons), (second, others, _) = _twice(fit)
         text = f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options"
-        found.wrong.extend((("measures", name), text) for name in values if values[name] != others[name])
+        found.errors.extend((("measures", name), text) for name in values if values[name] != others[name])
         if canonical_json(first) != canonical_json(second):
             raise ComponentError(text)
     except ComponentError as error:
-        found.wrong.append((path, str(error)))
+        found.errors.append((path, str(error)))
     except MISTAKES as error:
-        found.wrong.append((path, f"fails on the first data set: {reason(error)}"))
+        found.errors.append((path, f"fails on the first data set: {reason(error)}"))
     except BaseException as error:
         # Other data sets may not have such a failure.
         text = f"fails on the first data set: {reason(error)}; such estimates are stored as FAILED"
-        found.odd.append((path, text))
+        found.warnings.append((path, text))
     else:
         for name, why in reasons.items():
             text = f"fails on the first data set, with the estimator {candidate.name!r}: {why}"
-            found.odd.append((("measures", name), f"{text}; such estimates are stored without it"))
+            found.warnings.append((("measures", name), f"{text}; such estimates are stored without it"))
         if first["status"] not in FAILURES and candidate.is_custom:
-            found.odd.extend(
+            found.warnings.extend(
                 (path, text) for text in _uncounted(first, true_values({"content": cell.content}), success)
             )
 
@@ -300,8 +307,8 @@ def _uncounted(row: Mapping[str, Any], truth: Mapping[str, float], success: Mapp
         names = ", ".join(row["parameters"] or {}) or "a model with another number of poles"
         yield f"returns {names}; true values are known of {', '.join(truth)} only"
     delays = [name for name in truth if is_delay(name)]
-    asked = {"delay_relative_error": delays, "parameter_relative_error": [n for n in truth if n not in delays]}
-    for rule, wanted in asked.items():
+    rules = {"delay_relative_error": delays, "parameter_relative_error": [n for n in truth if n not in delays]}
+    for rule, wanted in rules.items():
         lacking = [each for each in wanted if lacks[each]]
         if lacking and success.get(rule) is not None:
             yield f"returns no {', '.join(lacking)}, so that it never meets success.{rule}"

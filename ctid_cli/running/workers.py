@@ -39,7 +39,7 @@ TICK = 0.1
 GRACE = 3.0
 #: Lifetime of idle workers [s].
 IDLE = 300.0
-#: File next to the folders of jobs that tells workers to begin no further jobs.
+#: File next to the folders of jobs; while it exists, workers begin no further jobs.
 _STOP = "stop"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA", "NUMEXPR")
@@ -81,13 +81,13 @@ Results = Generator[tuple[Job, Ending] | None]
 
 
 def initialise(parent: int) -> None:
-    """Set up a new worker process: it leaves signals to its parent, and must not outlive it.
+    """Set up a new worker process: it ignores signals, which its parent handles, and ends with its parent.
 
-    Linux can be asked to see to that, elsewhere a thread looks now and then.
+    On Linux the kernel ends it; elsewhere a thread polls.
     """
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    # What a custom estimator prints must not stand between the lines of a table.
+    # Output of custom estimators must not mix with that of the command.
     sys.stdout = sys.stderr
     # Estimators report through their status; warnings of several workers at once would only garble the terminal.
     warnings.simplefilter("ignore")
@@ -109,7 +109,7 @@ def compute(task: Task, record: Path, limits: Limits) -> list[Entry]:
     """Compute the estimates of a job under limits, and keep a record of those begun and finished."""
     found: list[Entry] = []
     in_work = task.keys
-    # The traceback of a process that dies would garble the terminal; loky has asked for it.
+    # The traceback of a process that dies would garble the terminal; loky enables it.
     faulthandler.disable()
     try:
         record.parent.mkdir(exist_ok=True)
@@ -280,7 +280,7 @@ class LocalWorkers:
     def __init__(self, count: int, limits: Limits) -> None:
         self.count, self._limits = count, limits
         #: Why the last workers ended early.
-        self.trouble = ""
+        self.ended_by = ""
         self._made = TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True)
         self._folder = Path(self._made.name)
         self._numbers = itertools.count()
@@ -288,34 +288,35 @@ class LocalWorkers:
         self._at_work: dict[Job, tuple[Path, Future[Ending]]] = {}
 
     def results(self, jobs: Iterator[Job], stopping: StopRequest) -> Results:
-        """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while.
+        """Compute jobs and yield their endings in any order; None after a while without one.
 
-        If a worker dies, what was in work is yielded last, with what is known of it, and no further jobs are taken. The
-        job that waits for the next free worker, so that none waits for this process, is not computed after a stop.
+        If a worker dies, the jobs in progress are yielded last, with their records, and no further jobs are taken. One
+        job more than there are workers is submitted, so that no worker waits for this process; after a stop it is not
+        computed.
         """
         stop = self._folder / _STOP
         stop.unlink(missing_ok=True)
-        self.trouble = ""
+        self.ended_by = ""
 
         def submit(*call: Any) -> Future[Ending]:
             try:
                 return _loky_thread(os.getpid()).submit(_submit_to_loky, self.count, *call).result()
             except Exception as error:
                 failed: Future[Ending] = Future()
-                # Its frames hold what descriptors there are.
+                # The frames of its traceback would keep descriptors open.
                 failed.set_exception(error.with_traceback(None))
                 return failed
 
         def died(job: Job, error: Exception) -> Ending:
             if not isinstance(error, BrokenExecutor | OSError | MemoryError):
                 raise error
-            self.trouble = str(error).strip().partition("\n")[0] or type(error).__name__
-            return _remains(self._at_work[job][0], self.trouble)
+            self.ended_by = str(error).strip().partition("\n")[0] or type(error).__name__
+            return _remains(self._at_work[job][0], self.ended_by)
 
         def at_once() -> int:
             if stopping():
                 stop.touch()
-            return 0 if self.trouble else self.count + 1
+            return 0 if self.ended_by else self.count + 1
 
         yield from self._computed(jobs, compute_unless_stopped, submit, at_once, died, stopping)
 
@@ -354,7 +355,7 @@ class LocalWorkers:
                     shutil.rmtree(record.parent, ignore_errors=True)
                 yield over
         finally:
-            # What is in work would be waited for.
+            # Jobs in progress would delay the end.
             while not all(future.done() for _, future in self._at_work.values()):
                 for record, _ in self._at_work.values():
                     _kill(record)
@@ -362,7 +363,10 @@ class LocalWorkers:
             self._at_work.clear()
 
     def _watch(self, stopping: StopRequest) -> None:
-        """Kill what goes on after a stop, or what its own watchdog should have ended: a stopped process has none."""
+        """Kill jobs that continue after a stop, or that their own watchdog should have ended at their wall time.
+
+        A process that is stopped (SIGSTOP) has no watchdog.
+        """
         limit = self._limits.wall_seconds
         for record, _ in self._at_work.values():
             if stopping.overdue:
@@ -371,7 +375,7 @@ class LocalWorkers:
                 continue
             with suppress(OSError):
                 seconds = time.time() - record.stat().st_mtime
-                # What it imports before its first estimate counts for none.
+                # The time of imports before the first estimate does not count.
                 if seconds > limit * 1.5 + GRACE and _remains(record, "").begun:
                     _late(record).write_bytes(b"killed")
                     _kill(record)

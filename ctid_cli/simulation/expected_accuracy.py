@@ -15,7 +15,7 @@ from ctid_cli.inference.bounds import (
     accuracy_of_records,
     require_uncorrelated_input,
 )
-from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term, degrees_of
 from ctid_cli.models.controller import ContinuousController, DiscreteController, Relay
 from ctid_cli.models.factoring import factored, unfactored
 from ctid_cli.models.several_inputs import MultiInputModel
@@ -59,8 +59,10 @@ def expected_accuracy(
     return replace(accuracy, parameters=replace(parameters, values=np.where(rounding, 0.0, parameters.values)))
 
 
-def why_biased(source: SimulatedSource, estimator: Any) -> str:
+def why_biased(source: Any, estimator: Any) -> str:
     """Return why an estimator is asymptotically biased; empty if theory gives no reason."""
+    if not isinstance(source, SimulatedSource):
+        return ""
     try:
         _unbiased(source, estimator)
     except BiasedError as error:
@@ -82,10 +84,18 @@ def _unbiased(source: SimulatedSource, estimator: Any) -> EstimatedForm:
     ):
         raise DataError("the theory here does not cover custom systems, noises and estimators")
     estimated = _estimated(system, estimator)
-    if loop is None or estimated.instruments != "open_loop" or not isinstance(loop.controller, DiscreteController):
+    if loop is None or estimated.instruments != "open_loop" or noise is None:
         return estimated
-    if isinstance(sampling, RegularSampling) and isinstance(noise, Noise):
-        require_uncorrelated_input(system, sampling.interval, loop.controller, noise.filter)
+    controller = loop.controller
+    if isinstance(controller, ContinuousController):
+        what = "the controller acts in continuous time, so that the input is correlated with the noise"
+        raise BiasedError(f"{what} (closed_loop instruments are not)")
+    if (
+        isinstance(sampling, RegularSampling)
+        and isinstance(noise, Noise)
+        and isinstance(controller, DiscreteController)
+    ):
+        require_uncorrelated_input(system, sampling.mean_interval, controller, noise.filter)
     return estimated
 
 
@@ -128,6 +138,9 @@ def _in_terms(system: AdditiveModel | TransferFunction, terms: tuple[Term, ...])
         found = _matched(submodels, order)
         if found is not None:
             return AdditiveModel(found, system.delay).sorted()
+    poles, needed = degrees_of(terms)[0], degrees_of([submodel.term() for submodel in submodels])[0]
+    if poles < needed:
+        raise BiasedError(f"the estimator's terms have {poles} poles, the system {needed}: they cannot represent it")
     numbers = f"the estimator's terms ({len(terms)}) do not match the submodels of the system ({len(submodels)})"
     raise DataError(f"{numbers}: they cannot represent it, or have additional parameters that no data determine")
 

@@ -17,7 +17,7 @@ from ctid_cli.kinds import classes
 from ctid_cli.signals.excitation import Excitation
 from ctid_cli.signals.sampling import Sampling
 from ctid_cli.simulation.components import Estimator, Measure, Noise, System
-from ctid_cli.specification.messages import Complaint, several_wrong
+from ctid_cli.specification.messages import Violation, several_wrong
 from ctid_cli.specification.sections import Section, section_for
 from ctid_cli.specification.sweeps import variants
 from ctid_cli.specification.values import ByShape, Name, Number, OneOf, Text
@@ -108,7 +108,7 @@ class CustomSection(Section):
 
     custom: ClassVar[bool] = True
 
-    def complaints(self) -> Iterator[Complaint]:
+    def violations(self) -> Iterator[Violation]:
         """Yield a problem if the component cannot be sent to worker processes."""
         from joblib.externals.loky.backend.reduction import dumps
 
@@ -141,9 +141,9 @@ class CustomSystemSection(CustomSection):
 
     truth: dict[str, Annotated[float | str, ByShape(Number, "the name of an option is allowed too", text=Text)]] = {}  # noqa: RUF012
 
-    def complaints(self) -> Iterator[Complaint]:
+    def violations(self) -> Iterator[Violation]:
         """Yield invalid true values."""
-        yield from super().complaints()
+        yield from super().violations()
         fields = {name: getattr(self, name) for name in type(self).model_fields}
         numbers = [name for name, value in fields.items() if isinstance(value, (int, float, list))]
         for name, value in self.truth.items():

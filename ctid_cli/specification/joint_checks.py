@@ -1,4 +1,4 @@
-"""Errors of a specification in which every section is valid on its own."""
+"""Errors of a specification in which every section is valid on its own, and warnings about questionable settings."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -16,7 +16,8 @@ from ctid_cli.inference.monte_carlo import MEASURES, requested
 from ctid_cli.kinds import KINDS
 from ctid_cli.models.controller import Relay
 from ctid_cli.models.several_inputs import is_delay
-from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.models.transfer_function import TransferFunction, cancelled
+from ctid_cli.signals.noise import stream
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance
 from ctid_cli.simulation.components import is_custom
@@ -24,7 +25,7 @@ from ctid_cli.simulation.dataset import located
 from ctid_cli.simulation.start_points import additive_form
 from ctid_cli.specification import sweeps
 from ctid_cli.specification.custom_sections import CustomMeasureSection
-from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.messages import Violation
 from ctid_cli.specification.sections import place_of
 from ctid_cli.specification.spec import OF_DATA, Spec
 from ctid_cli.specification.sweeps import Case, Cases
@@ -37,6 +38,11 @@ MAX_SAMPLES = 10_000_000
 MAX_SETTINGS = 1_000_000
 #: Maximum number of settings whose first data sets are tried.
 MAX_TRIALS = 64
+#: Minimum record length beyond the delay, in time constants of the slowest pole: in shorter records the standard
+#: error of the pole grows much faster than it would fall with the number of samples in longer ones.
+TIME_CONSTANTS = 3.0
+#: Input edges within this fraction of the sampling interval of a sample count as simultaneous with it.
+ON_TIME = 1e-6
 #: Success rules of systems and of signals.
 _RULES_OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
 _RULES_OF_SIGNALS = ("band", "by", "window")
@@ -58,11 +64,11 @@ def too_many_cases(spec: Spec) -> str:
     return ""
 
 
-def joint_complaints(
-    spec: Spec, broken: frozenset[str], trial: Callable[[Spec], Iterable[Complaint]], *, files_are_good: bool
-) -> list[Complaint]:
+def joint_violations(
+    spec: Spec, broken: frozenset[str], trial: Callable[[Spec], Iterable[Violation]], *, files_are_good: bool
+) -> list[Violation]:
     """Return the contradictions between sections of a specification, and the problems found by a trial."""
-    found = [*_of_names(spec), *_of_missing(spec, broken), *_of_worlds(spec, broken)]
+    found = [*_of_names(spec), *_of_missing(spec, broken), *_of_kinds(spec, broken)]
     cases = cases_of(spec, files_are_good=files_are_good)
     too_long = list(sweeps.checked(cases, (_of_length,)))
     usable = {name: given for name, given in cases.items() if not too_long or name not in ("sampling", "duration")}
@@ -95,11 +101,6 @@ def cases_of(spec: Spec, *, files_are_good: bool = True) -> Cases:
         found["disturbance"] = {("disturbance",): [(None, {})]}
     # The loop, if any, that may stabilise an unstable system.
     found["feedback"] = {("loop",): [(None, {})]} if spec.loop is None else found["loop"]
-    # The systems, each with the name of its input if there are several.
-    found["driven"] = {
-        path: [(("" if path[1:] == () else str(path[1]), one), swept) for one, swept in cases]
-        for path, cases in found["system"].items()
-    }
     found["generator"] = {path: _cases(spec, path, section) for path, section in spec.generators.items()}
     found["truth"] = {
         path: [(truth_of(one), sweeps.swept_in({path: one})) for one in sweeps.variants(section)]
@@ -158,7 +159,7 @@ def _single_cases(spec: Spec) -> dict[str, dict[KeyPath, list[Case]]]:
 # Names and missing sections
 
 
-def _of_names(spec: Spec) -> Iterator[Complaint]:
+def _of_names(spec: Spec) -> Iterator[Violation]:
     """Yield unknown and duplicate measures."""
     names: set[str] = set()
     for k, one in enumerate(spec.measures or ()):
@@ -178,7 +179,7 @@ def _of_names(spec: Spec) -> Iterator[Complaint]:
             yield ("estimators", name), f"the same settings as {other!r}; its estimates would be the same too"
 
 
-def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
+def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Violation]:
     """Yield missing sections, except those that are present but invalid."""
     place = ("monte_carlo", "until", "percent_half_width")
     until = None if spec.monte_carlo is None or spec.data is not None else spec.monte_carlo.until
@@ -194,8 +195,8 @@ def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
         give = "give loop, or data.reference and loop.controller for a measured record"
         message = f"closed-loop instruments need the reference and the controller; {give}"
         for name, section in spec.estimators.items():
-            asked = [] if section.custom else np.atleast_1d(getattr(section, "instruments", "open_loop")).tolist()
-            if "closed_loop" in asked:
+            instruments = [] if section.custom else np.atleast_1d(getattr(section, "instruments", "open_loop")).tolist()
+            if "closed_loop" in instruments:
                 yield ("estimators", name, "instruments"), message
     if spec.data is None and not _is_regular(spec):
         if spec.signal is not None:
@@ -204,7 +205,7 @@ def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
             yield ("sampling", "kind"), "must be regular in a loop: the controller is discrete and acts at every sample"
 
 
-def _of_worlds(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
+def _of_kinds(spec: Spec, broken: frozenset[str]) -> Iterator[Violation]:
     """Yield estimators and success rules that belong to the other kind of experiment."""
     on_signal = spec.signal is not None
     if not on_signal and ("signal" in broken or (spec.system is None and spec.data is None)):
@@ -231,17 +232,17 @@ def _is_regular(spec: Spec) -> bool:
 # Records and loops
 
 
-def _of_length(length: int) -> Iterator[Complaint]:
+def _of_length(length: int) -> Iterator[Violation]:
     if length > MAX_SAMPLES:
         yield ("length",), f"more than {MAX_SAMPLES} samples in a record are not supported"
 
 
-def _of_delay(system: Any, duration: float) -> Iterator[Complaint]:
+def _of_delay(system: Any, duration: float) -> Iterator[Violation]:
     if system.delay >= duration:
         yield ("system", "delay"), f"{system.delay:g} s is not shorter than the record ({duration:g} s)"
 
 
-def _of_greatest_delay(estimator: Any, duration: float) -> Iterator[Complaint]:
+def _of_greatest_delay(estimator: Any, duration: float) -> Iterator[Violation]:
     bounds = getattr(estimator, "delay_bounds", None)
     key, latest = ("delay", getattr(estimator, "delay", 0.0)) if bounds is None else ("delay_bounds", bounds[1])
     if latest >= duration and latest > 0:
@@ -249,25 +250,25 @@ def _of_greatest_delay(estimator: Any, duration: float) -> Iterator[Complaint]:
         yield ("estimator", key), text
 
 
-def _of_clock_periods(generator: Any, duration: float) -> Iterator[Complaint]:
+def _of_clock_periods(generator: Any, duration: float) -> Iterator[Violation]:
     clock = getattr(generator, "clock_period", None)
     if clock is not None and duration / clock > MAX_SAMPLES:
         message = f"a record of {duration:g} s has more than {MAX_SAMPLES} clock periods of {clock:g} s"
         yield ("generator", "clock_period"), message
 
 
-def _of_ratio(loop: Any, noise: Any) -> Iterator[Complaint]:
+def _of_ratio(loop: Any, noise: Any) -> Iterator[Violation]:
     if noise.snr_db is not None:
         other = ", or its innovation_variance" if hasattr(noise, "innovation_variance") else ""
         yield ("noise", "snr_db"), f"in a loop the noise feeds back into the output; give the noise's variance{other}"
 
 
-def _of_relay(loop: Any, data: Any) -> Iterator[Complaint]:
+def _of_relay(loop: Any, data: Any) -> Iterator[Violation]:
     if isinstance(loop.controller, Relay):
         yield ("loop",), "a relay is for simulated data; leave the loop out, the record of its input says enough"
 
 
-def _of_unstable_system(feedback: Any, system: Any) -> Iterator[Complaint]:
+def _of_unstable_system(feedback: Any, system: Any) -> Iterator[Violation]:
     """Yield an unstable system without a linear loop; a trial shows whether a loop stabilises it."""
     if feedback is not None and not isinstance(feedback.controller, Relay):
         return
@@ -292,7 +293,7 @@ def _unstable(poles: ComplexArray) -> str:
     return f"{noun} at {', '.join(offending)} rad/s; {remedy}"
 
 
-def _of_custom_system(loop: Any, custom_system: Any) -> Iterator[Complaint]:
+def _of_custom_system(loop: Any, custom_system: Any) -> Iterator[Violation]:
     yield ("system", "kind"), "a loop needs a transfer function in it; give excitation in place of loop"
 
 
@@ -300,7 +301,7 @@ def _of_custom_system(loop: Any, custom_system: Any) -> Iterator[Complaint]:
 # Starts and true values
 
 
-def _of_start(start: Sequence[Start], named: tuple[str, Any]) -> Iterator[Complaint]:
+def _of_start(start: Sequence[Start], named: tuple[str, Any]) -> Iterator[Violation]:
     name, estimator = named
     for one in start:
         if getattr(estimator, "start_from", None) == ("delay" if one.model is None else "parameters"):
@@ -311,7 +312,7 @@ def _of_start(start: Sequence[Start], named: tuple[str, Any]) -> Iterator[Compla
                 return
 
 
-def _of_relative_start(relative_start: Any, system: Any, named: tuple[str, Any]) -> Iterator[Complaint]:
+def _of_relative_start(relative_start: Any, system: Any, named: tuple[str, Any]) -> Iterator[Violation]:
     try:
         model = additive_form(system)
     except DataError as error:
@@ -321,16 +322,16 @@ def _of_relative_start(relative_start: Any, system: Any, named: tuple[str, Any])
         yield from ((("relative_start",), text) for _, text in _of_start([Start(model=model)], named))
 
 
-def _of_unknown_parameters(relative_start: Any, data: Any) -> Iterator[Complaint]:
+def _of_unknown_parameters(relative_start: Any, data: Any) -> Iterator[Violation]:
     unknown = "the parameters of a measured record are not known"
     yield ("relative_start",), f"{unknown}; give values: {{additive: [submodels]}}"
 
 
-def _of_unknown_structure(relative_start: Any, custom_system: Any) -> Iterator[Complaint]:
+def _of_unknown_structure(relative_start: Any, custom_system: Any) -> Iterator[Violation]:
     yield ("relative_start",), "a custom system has no known structure; give values: {additive: [submodels]}"
 
 
-def _of_relative_errors(success: Any, truth: Mapping[str, float]) -> Iterator[Complaint]:
+def _of_relative_errors(success: Any, truth: Mapping[str, float]) -> Iterator[Violation]:
     delays = [name for name in truth if is_delay(name)]
     rules = {"delay_relative_error": delays or ["delay"], "parameter_relative_error": [*truth.keys() - {*delays}]}
     for rule, names in rules.items():
@@ -343,23 +344,23 @@ def _of_relative_errors(success: Any, truth: Mapping[str, float]) -> Iterator[Co
             yield ("success", rule), f"{text}; use fit_percent, or leave it out"
 
 
-def _of_unknown_values(success: Any, data: Any) -> Iterator[Complaint]:
+def _of_unknown_values(success: Any, data: Any) -> Iterator[Violation]:
     for rule, unknown in (("delay_relative_error", "true values"), ("parameter_relative_error", "parameters")):
         if getattr(success, rule) is not None:
             text = f"the {unknown} of a measured record are not known; use fit_percent, or leave it out"
             yield ("success", rule), text
 
 
-def _of_one_record(until: Any, data: Any) -> Iterator[Complaint]:
+def _of_one_record(until: Any, data: Any) -> Iterator[Violation]:
     yield ("until",), "a measured record is one data set; give runs: 1 in place of until and at_most"
 
 
-def _of_error_of_a_signal(until: Any, signal: Any) -> Iterator[Complaint]:
+def _of_error_of_a_signal(until: Any, signal: Any) -> Iterator[Violation]:
     if until.rmse_relative is not None:
         yield ("until", "rmse_relative"), "needs the true values of a simulated system; use percent_half_width"
 
 
-def _of_error(until: Any, truth: Mapping[str, float]) -> Iterator[Complaint]:
+def _of_error(until: Any, truth: Mapping[str, float]) -> Iterator[Violation]:
     if until.rmse_relative is not None and not truth:
         yield ("until", "rmse_relative"), "needs true values: system.truth: {gain: 1.0}"
 
@@ -368,19 +369,19 @@ def _of_error(until: Any, truth: Mapping[str, float]) -> Iterator[Complaint]:
 # Frequencies of a signal
 
 
-def _of_frequencies(signal: Any, sampling: Any) -> Iterator[Complaint]:
+def _of_frequencies(signal: Any, sampling: Any) -> Iterator[Violation]:
     highest, limit = signal.highest_frequency, math.pi / sampling.mean_interval
     if highest >= limit:
         yield ("sampling", "interval"), f"shows frequencies below {limit:.4g} rad/s only, the signal has {highest:g}"
 
 
-def _of_steps(signal: Any, duration: float) -> Iterator[Complaint]:
+def _of_steps(signal: Any, duration: float) -> Iterator[Violation]:
     for step in signal.steps:
         if step >= duration:
             yield ("signal", "tones"), f"a step at {step:g} s comes after the last sample, {duration:g} s"
 
 
-def _of_times(success: Any, signal: Any, sampling: Any) -> Iterator[Complaint]:
+def _of_times(success: Any, signal: Any, sampling: Any) -> Iterator[Violation]:
     duration = sampling.mean_interval * sampling.length
     low, high = success.window or (0.0, duration)
     if high > duration * (1 + 1e-9) or high - low < sampling.mean_interval:
@@ -389,14 +390,14 @@ def _of_times(success: Any, signal: Any, sampling: Any) -> Iterator[Complaint]:
         yield ("success", "by"), f"{success.by:g} s come after the end of the record, {duration:g} s"
 
 
-def _of_tones(estimator: Any, signal: Any, disturbance: Any) -> Iterator[Complaint]:
+def _of_tones(estimator: Any, signal: Any, disturbance: Any) -> Iterator[Violation]:
     count, sine = len(signal.tones), isinstance(disturbance, SineDisturbance)
     if estimator.tones != count and not (sine and estimator.tones == count + 1):
         more = ", or one more for the sinusoid that disturbs it" if sine else ""
         yield ("estimator", "tones"), f"must be {count}, as many as the signal has{more}, not {estimator.tones}"
 
 
-def _of_options(estimator: Any, signal: Any, sampling: Any) -> Iterator[Complaint]:
+def _of_options(estimator: Any, signal: Any, sampling: Any) -> Iterator[Violation]:
     try:
         with np.errstate(all="ignore"):
             estimator.check(sampling.samples, sampling.interval)
@@ -423,4 +424,96 @@ CHECKS = (
     *(_of_start, _of_relative_start, _of_unknown_parameters, _of_unknown_structure),
     *(_of_relative_errors, _of_unknown_values, _of_one_record, _of_error_of_a_signal, _of_error),
     *(_of_frequencies, _of_steps, _of_times, _of_tones, _of_options),
+)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Warnings about valid but questionable settings
+
+
+def joint_warnings(spec: Spec) -> list[Violation]:
+    """Return the warnings."""
+    cases = cases_of(spec)
+    warnings = [*sweeps.checked(cases, WARNINGS), *sweeps.checked(cases, (_of_sampled_input,), MAX_TRIALS)]
+    if spec.starts is not None:
+        first = [sweeps.variants(section)[0].options for section in spec.estimators.values()]
+        taken = {getattr(options, "start_from", None) for options in first}
+        for name, kind in (("initial_delay", "delay"), ("parameters", "parameters")):
+            if getattr(spec.starts, name) and kind not in taken:
+                warnings.append((("starts", name), "no estimator here uses a start of this kind; each is run once"))
+    return warnings
+
+
+def _of_runs(monte_carlo: Any, data: Any) -> Iterator[Violation]:
+    if monte_carlo.most > 1:
+        yield ("monte_carlo", "runs"), "a measured record is one data set; it is run once"
+
+
+def _of_slow_sampling(system: Any, sampling: Any) -> Iterator[Violation]:
+    interval, fastest = sampling.mean_interval, float(np.abs(system.poles).max(initial=0.0))
+    if interval * fastest > math.pi:
+        slow = f"sampling every {interval:g} s is slower than twice the fastest pole ({fastest:.4g} rad/s)"
+        key = ("interval",) if hasattr(sampling, "interval") else ()
+        yield ("sampling", *key), f"{slow}; intervals below {math.pi / fastest:.4g} s see it"
+
+
+def _of_short_record(system: Any, duration: float) -> Iterator[Violation]:
+    # A lightly damped mode is visible within one period, long before it has decayed.
+    frequencies = np.abs(system.poles)
+    slowest = float(1.0 / frequencies[frequencies > 0.0].min(initial=math.inf))
+    needed = float(system.delay + TIME_CONSTANTS * slowest)
+    if duration < needed:
+        delayed = f", {system.delay:g} s of it delay," if system.delay else ""
+        short = f"a record of {duration:.4g} s{delayed} shows little of the slowest pole"
+        cure = f"it must last {needed:.3g} s or more"
+        yield ("duration",), f"{short}, whose time constant is {slowest:.4g} s; {cure}"
+
+
+def _of_cancellation(system: Any) -> Iterator[Violation]:
+    for part in getattr(system, "submodels", [system] if isinstance(system, TransferFunction) else []):
+        if place := cancelled(part.numerator, part.denominator):
+            cure = "leave both out, unless that is the point"
+            yield ("system",), f"a zero cancels the pole at s = {place}, so that no data determine either; {cure}"
+
+
+def _of_sampled_input(excitation: Any, sampling: Any, seed: int) -> Iterator[Violation]:
+    if sampling.input_record != "sampled":
+        return
+    try:
+        times = sampling.times(stream(seed, "sampling", 0))
+        applied = excitation.generate(times, stream(seed, "input", 0))
+    except DataError as error:  # in a case that was not tried
+        yield ("excitation",), f"{error}; estimates of such data sets are stored as FAILED"
+        return
+    if applied.hold != "zoh":
+        return
+    edges = applied.t[1:][np.diff(applied.values) != 0.0]
+    edges = edges[edges < times[-1]]
+    interval = sampling.mean_interval
+    late = times[np.searchsorted(times, edges - ON_TIME * interval)] - edges
+    if late.size and late.mean() > ON_TIME * interval:
+        seen = f"the estimator sees the input at its samples only, each change {late.mean():.2g} s late on average"
+        biased = "which biases delay and parameters; write input_record: exact, unless that is the point"
+        yield ("sampling", "input_record"), f"{seen}, {biased}"
+
+
+def _of_white_formula(noise: Any, estimator: Any) -> Iterator[Violation]:
+    if getattr(noise, "coloured", False) and getattr(estimator, "covariance", "") == "white":
+        short = "is for white noise and the noise is coloured, so that the intervals are too short or too long"
+        yield ("estimator", "covariance"), f"{short}; write covariance: auto, unless that is the point"
+
+
+def _of_whole_record(estimator: Any, signal: Any) -> Iterator[Violation]:
+    if estimator.whole_record and signal.frequency_steps:
+        yield ("estimator", "kind"), "gives one estimate of the whole record, in which a frequency steps"
+
+
+def _of_warnings(estimator: Any, signal: Any, sampling: Any) -> Iterator[Violation]:
+    for name, text in estimator.warnings(sampling.interval, signal.highest_frequency):
+        yield ("estimator", name), text
+
+
+WARNINGS = (
+    *(_of_runs, _of_slow_sampling, _of_short_record, _of_cancellation),
+    *(_of_white_formula, _of_whole_record, _of_warnings),
 )

@@ -13,9 +13,8 @@ from ctid_cli.signals.files import is_inside
 from ctid_cli.signals.measurement import read_held_signal
 from ctid_cli.simulation.dataset import LoopOptions, file_sha256, joined, located
 from ctid_cli.specification.custom_sections import names_code
-from ctid_cli.specification.joint_checks import joint_complaints, too_many_cases
-from ctid_cli.specification.joint_warnings import joint_warnings
-from ctid_cli.specification.messages import Complaint, explained, shown
+from ctid_cli.specification.joint_checks import joint_violations, joint_warnings, too_many_cases
+from ctid_cli.specification.messages import Violation, explained, shown
 from ctid_cli.specification.sections import Section
 from ctid_cli.specification.spec import Spec, SpecPart
 from ctid_cli.specification.sweeps import case_count, replaced, variants
@@ -46,29 +45,30 @@ def load_spec(
     if not isinstance(tree, dict):
         message = f"the file must hold a mapping that begins with 'experiment: name', not {shown(tree)}"
         raise SpecError([source.problem((), "the file is empty" if tree is None else message)])
-    spec, complaints = _validated(source, folder, allow_code)
-    broken = frozenset(str(where[0]) for where, _ in complaints if where)
+    spec, violations = _validated(source, folder, allow_code)
+    broken = frozenset(str(where[0]) for where, _ in violations if where)
     if too_many := too_many_cases(spec):
         raise SpecError([source.problem((), too_many)])
     spec, about_files = _with_files(spec, own=isinstance(given, Mapping), anywhere=allow_outside)
-    odd: list[Complaint] = []
+    from_trial: list[Violation] = []
 
-    def tried(part: Spec) -> Sequence[Complaint]:
+    def tried(part: Spec) -> Sequence[Violation]:
         found = trial(part) if trial is not None else None
-        odd.extend(found.odd if found is not None else ())
-        return found.wrong if found is not None else ()
+        from_trial.extend(found.warnings if found is not None else ())
+        return found.errors if found is not None else ()
 
-    joint = joint_complaints(spec, broken, tried, files_are_good=not about_files)
-    _require_none(source, [*complaints, *about_files, *joint])
-    spec._warnings = tuple(str(source.problem(where, message)) for where, message in (*joint_warnings(spec), *odd))
+    joint = joint_violations(spec, broken, tried, files_are_good=not about_files)
+    _require_none(source, [*violations, *about_files, *joint])
+    warnings = [*joint_warnings(spec), *from_trial]
+    spec._warnings = tuple(str(source.problem(where, message)) for where, message in warnings)
     return spec
 
 
 def spec_from_canonical(canonical: Mapping[str, Any], folder: Path | None = None, *, allow_code: bool = False) -> Spec:
     """Return a specification from its canonical form."""
     source = YamlSource("(stored specification)", tree=dict(canonical))
-    spec, complaints = _validated(source, folder or Path(), allow_code)
-    _require_none(source, complaints)
+    spec, violations = _validated(source, folder or Path(), allow_code)
+    _require_none(source, violations)
     return spec
 
 
@@ -100,9 +100,9 @@ def json_schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "ctid experiment"}
 
 
-def _require_none(source: YamlSource, complaints: Sequence[Complaint]) -> None:
+def _require_none(source: YamlSource, violations: Sequence[Violation]) -> None:
     """Raise a SpecError if there are problems: each one once, in the order of the file."""
-    problems = {source.problem(where, message) for where, message in complaints}
+    problems = {source.problem(where, message) for where, message in violations}
     if problems:
         in_order = sorted(problems, key=lambda p: (p.file == OVERRIDE_FILE, p.line, p.column, p.key, p.message))
         raise SpecError(in_order)
@@ -120,7 +120,7 @@ def _code_in(tree: Any, folder: Path) -> Iterator[KeyPath]:
             yield path
 
 
-def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec, list[Complaint]]:
+def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec, list[Violation]]:
     """Return the valid part of a specification, and all problems of its individual sections."""
     tree = source.tree
     # A specification is untrusted input.
@@ -128,45 +128,45 @@ def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec
     code = [source.problem(path, ask) for path in _code_in(tree, folder)]
     if code and not allow_code:
         raise RefusedError("\n".join(map(str, sorted(code, key=lambda p: (p.line, p.column)))))
-    spec, complaints = _right_part(tree, folder)
-    complaints += [((*where, KEY), message) for where, message in presence_complaints(spec, tree)]
+    spec, violations = _right_part(tree, folder)
+    violations += [((*where, KEY), message) for where, message in presence_violations(spec, tree)]
     # Invalid sections are excluded from the following checks.
-    wrong = {str(where[0]) for where, _ in complaints if where and where[0] != "estimators"}
+    wrong = {str(where[0]) for where, _ in violations if where and where[0] != "estimators"}
     spec = spec.model_copy(update=dict.fromkeys(wrong & Spec.model_fields.keys()))
     spec._folder, spec._source = folder, source
-    return spec, complaints
+    return spec, violations
 
 
-def _right_part(tree: Mapping[str, Any], folder: Path) -> tuple[Spec, list[Complaint]]:
+def _right_part(tree: Mapping[str, Any], folder: Path) -> tuple[Spec, list[Violation]]:
     """Return the valid sections and estimators, and the problems of the others."""
     context = {"folder": folder, "of_signal": tree.get("signal") is not None}
     try:
         return Spec.model_validate(tree, context=context), []
     except ValidationError as error:
-        complaints = [explained(detail, {}) for detail in error.errors(include_url=False)]
-    places = [where for where, _ in complaints]
+        violations = [explained(detail, {}) for detail in error.errors(include_url=False)]
+    places = [where for where, _ in violations]
     right = {name: value for name, value in tree.items() if not any(where[:1] == (name,) for where in places)}
     named = tree.get("estimators")
     if isinstance(named, Mapping):
         faulty = {where[1] for where in places if where[:1] == ("estimators",) and len(where) > 1}
         right["estimators"] = {name: value for name, value in named.items() if name not in faulty}
-    return SpecPart.model_validate(right, context=context), complaints
+    return SpecPart.model_validate(right, context=context), violations
 
 
-def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Complaint]]:
+def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Violation]]:
     """Return the specification with the content hashes of its files, and the problems of the files."""
     sections: dict[KeyPath, Any] = {("data",): spec.data, ("sampling",): spec.sampling}
     if spec.data is None:
         sections |= spec.generators
-    complaints: list[Complaint] = []
+    violations: list[Violation] = []
     for place, section in sections.items():
         if hasattr(section, "sha256") and not section.custom:
             try:
                 content = _checked_content(spec, place, section, own=own, anywhere=anywhere)
                 spec = replaced(spec, (*place, "sha256"), content)
             except DataError as error:
-                complaints.append(((*place, error.field or "file"), str(error)))
-    return spec, complaints
+                violations.append(((*place, error.field or "file"), str(error)))
+    return spec, violations
 
 
 def _checked_content(spec: Spec, place: KeyPath, section: Any, *, own: bool, anywhere: bool) -> str:
@@ -234,7 +234,7 @@ EXPERIMENTS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
 }
 
 
-def presence_complaints(spec: Spec, raw: Mapping[str, Any]) -> Iterator[Complaint]:
+def presence_violations(spec: Spec, raw: Mapping[str, Any]) -> Iterator[Violation]:
     """Yield missing and superfluous sections, independent of their content."""
     present = {name for name in Spec.model_fields if raw.get(name) is not None}
     kind = next((kind for kind in EXPERIMENTS if kind in present), "system")

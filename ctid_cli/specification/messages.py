@@ -13,7 +13,7 @@ from ctid_cli.specification.yaml_source import KEY, KeyPath
 from ctid_cli.text import did_you_mean
 
 #: Key path inside a section, and the problem there.
-Complaint = tuple[KeyPath, str]
+Violation = tuple[KeyPath, str]
 
 #: Prefix of the tags of unions, which pydantic puts into error locations; no text from YAML contains it.
 TAG = "\0"
@@ -53,18 +53,18 @@ def wrong(message: str) -> PydanticCustomError:
     return PydanticCustomError("said", "{message}", {"message": message})
 
 
-def several_wrong(title: str, problems: Iterable[Complaint]) -> ValidationError:
+def several_wrong(title: str, problems: Iterable[Violation]) -> ValidationError:
     """Return one validation error with several problems."""
     details = [InitErrorDetails(type=wrong(message), loc=path, input=None) for path, message in problems]
     return ValidationError.from_exception_data(title, details)
 
 
-def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Complaint:
+def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Violation:
     """Return the place and message of a pydantic error in a section with the given field descriptions."""
     parts = [str(part) for part in error["loc"]]
     path = tuple(part for part in error["loc"] if not str(part).startswith(TAG))
     kind, value, context = error["type"], error["input"], error.get("ctx", {})
-    path, kind, value, context = _told(path, kind, value, context, descriptions)
+    path, kind, value, context = _specific(path, kind, value, context, descriptions)
     if kind not in SENTENCES:
         return path, error["msg"]
     if kind in ("missing", "extra_forbidden", "decimal_comma", "no_colon"):
@@ -76,7 +76,7 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Complaint
     return path, SENTENCES[kind].format(**words) + _hint(kind, value, words) + "".join(hints)
 
 
-def _told(
+def _specific(
     path: KeyPath, kind: str, value: Any, context: dict[str, Any], known: Collection[str]
 ) -> tuple[KeyPath, str, Any, dict[str, Any]]:
     """Return place, type, value and context for the message, which replace those of pydantic if they are too vague."""

@@ -23,8 +23,8 @@ from ctid_cli.arrays import Array
 from ctid_cli.custom_code import reason
 from ctid_cli.errors import CtidError, OptionError
 from ctid_cli.signals.checks import require_integer
-from ctid_cli.specification.messages import Complaint, explained, option_docs, several_wrong
-from ctid_cli.specification.sweeps import MAX_COMBINATIONS, option_complaints
+from ctid_cli.specification.messages import Violation, explained, option_docs, several_wrong
+from ctid_cli.specification.sweeps import MAX_COMBINATIONS, option_violations
 from ctid_cli.specification.values import ByShape, Coefficients, Number, OneOf, Swept, Text, Whole
 from ctid_cli.specification.yaml_source import KEY
 from ctid_cli.text import closest
@@ -71,10 +71,10 @@ class Section(BaseModel):
             # The key meant by a misspelt one is not also reported as missing.
             unknown = [str(each["loc"][-1]) for each in details if each["type"] == "extra_forbidden"]
             meant = {closest(name, known) for name in unknown}
-            told = [each for each in details if each["type"] != "missing" or each["loc"][-1] not in meant]
-            problems += [explained(each, known) for each in told]
+            reported = [each for each in details if each["type"] != "missing" or each["loc"][-1] not in meant]
+            problems += [explained(each, known) for each in reported]
         else:
-            problems = problems or option_complaints(section) or list(section.complaints())
+            problems = problems or option_violations(section) or list(section.violations())
             if not problems:
                 return section
         other = cls.elsewhere
@@ -87,11 +87,11 @@ class Section(BaseModel):
         return error.errors(include_url=False)
 
     @classmethod
-    def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
+    def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Violation]:
         """Yield missing or superfluous keys, independent of their values."""
         yield from ()
 
-    def complaints(self) -> Iterator[Complaint]:
+    def violations(self) -> Iterator[Violation]:
         """Yield problems of a section in which every value is valid on its own."""
         if self.if_empty and all(getattr(self, name) is None for name in type(self).model_fields):
             yield (), self.if_empty
@@ -109,7 +109,7 @@ class Section(BaseModel):
     def options(self) -> Any:
         """Build the options; an OptionError names the refused option and the reason."""
         try:
-            with np.errstate(all="ignore"):  # overflow is refused here or by `complaints`
+            with np.errstate(all="ignore"):  # overflow is refused here or by `violations`
                 return self.build()
         except (Exception, SystemExit) as error:
             if self.custom and not isinstance(error, (ValueError, CtidError)):
@@ -143,7 +143,7 @@ class Geometric(Section):
 
     geometric: Annotated[list[Whole], Field(min_length=3, max_length=3)]
 
-    def complaints(self) -> Iterator[Complaint]:
+    def violations(self) -> Iterator[Violation]:
         """Yield the reason why there are no such numbers."""
         if self.geometric[2] > MAX_COMBINATIONS:
             yield ("geometric", 2), f"{self.geometric[2]} values are too many; at most {MAX_COMBINATIONS} are allowed"

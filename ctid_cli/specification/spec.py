@@ -21,7 +21,7 @@ from ctid_cli.signals.sampling import InputRecord, InstantsFile, ListedInstants,
 from ctid_cli.signals.sinusoids import SumOfSinusoids
 from ctid_cli.simulation.dataset import MeasuredSource, located
 from ctid_cli.specification.custom_sections import CustomMeasureSection, Kinds
-from ctid_cli.specification.messages import Complaint, wrong
+from ctid_cli.specification.messages import Violation, wrong
 from ctid_cli.specification.sections import Options, Section, WithKey, section_for
 from ctid_cli.specification.sweeps import variants
 from ctid_cli.specification.system_sections import (
@@ -115,7 +115,7 @@ class ListedTimesSection(Section):
     times: Annotated[list[Number], Field(min_length=2)]
     input_record: Annotated[InputRecord | list[InputRecord], Swept(InputRecord)] = "exact"
 
-    def complaints(self) -> Iterator[Complaint]:
+    def violations(self) -> Iterator[Violation]:
         """Yield the first instant that is not later than the one before it."""
         for k, (before, now) in enumerate(itertools.pairwise(self.times), start=1):
             if now <= before:
@@ -188,7 +188,7 @@ class MonteCarloSection(Section):
     at_most: Annotated[int | None, Field(ge=AT_LEAST, le=1_000_000)] = None
 
     @classmethod
-    def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
+    def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Violation]:
         """Yield the absence of a number of data sets, or conflicting rules for it."""
         given = {name for name in ("runs", "until", "at_most") if raw.get(name) is not None}
         if {"runs", "until"} <= given:
@@ -242,9 +242,9 @@ class SuccessSection(Section):
     by: Positive | None = None
     window: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None = None
 
-    def complaints(self) -> Iterator[Complaint]:
+    def violations(self) -> Iterator[Violation]:
         """Yield an empty rule, ``by`` or ``window`` without ``band``, and an empty window."""
-        yield from super().complaints()
+        yield from super().violations()
         if self.by is not None and self.band is None:
             yield ("by",), "is the time of settling into a band; add band [rad/s]"
         if self.window is not None and self.band is None:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel
 
 from ctid_cli.errors import OptionError
-from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.messages import Violation
 from ctid_cli.specification.values import Swept
 from ctid_cli.specification.yaml_source import KeyPath
 
@@ -26,7 +26,7 @@ Failure = tuple[KeyPath, str, Mapping[KeyPath, Any]]
 Case = tuple[Any, Mapping[KeyPath, Any]]
 #: All arguments of checks, by name and place.
 Cases = Mapping[str, Mapping[KeyPath, Sequence[Case]]]
-Check = Callable[..., Iterator[Complaint]]
+Check = Callable[..., Iterator[Violation]]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def replaced(section: AnySection, path: KeyPath, value: Any) -> AnySection:
     return section.model_copy(update={name: inner})
 
 
-def option_complaints(section: Any) -> list[Complaint]:
+def option_violations(section: Any) -> list[Violation]:
     """Return the problems that the option dataclass, if any, finds in the values of a section."""
     if section.target is None:
         return []
@@ -104,12 +104,12 @@ def option_complaints(section: Any) -> list[Complaint]:
     return grouped(failures, tried)
 
 
-def grouped(failures: Iterable[Failure], tried: Sequence[Mapping[KeyPath, Any]]) -> list[Complaint]:
+def grouped(failures: Iterable[Failure], tried: Sequence[Mapping[KeyPath, Any]]) -> list[Violation]:
     """Return problems of combinations, each once, with the swept values on which it depends."""
-    groups: dict[Complaint, list[Mapping[KeyPath, Any]]] = {}
+    groups: dict[Violation, list[Mapping[KeyPath, Any]]] = {}
     for path, message, swept in failures:
         groups.setdefault((path, message), []).append(swept)
-    complaints: list[Complaint] = []
+    violations: list[Violation] = []
     for (path, message), found in groups.items():
         names = [name for name in found[0] if len(_texts(name, found)) < len(_texts(name, tried))]
         if not names and len(found) < len(tried):
@@ -120,15 +120,15 @@ def grouped(failures: Iterable[Failure], tried: Sequence[Mapping[KeyPath, Any]])
             labels = list(dict.fromkeys(each))
             more = f"; and {len(labels) - 3} more" if len(labels) > 3 else ""
             message += f" (with {'; '.join(labels[:3])}{more})"
-        complaints.append((path, message))
-    return complaints
+        violations.append((path, message))
+    return violations
 
 
 def _texts(name: KeyPath, swept: Iterable[Mapping[KeyPath, Any]]) -> set[str]:
     return {json.dumps(one[name]) for one in swept}
 
 
-def checked(cases: Cases, checks: Iterable[Check], at_most: int | None = None) -> Iterator[Complaint]:
+def checked(cases: Cases, checks: Iterable[Check], at_most: int | None = None) -> Iterator[Violation]:
     """Yield problems found by checks in options that are valid on their own.
 
     The arguments of a check are named after the cases; each combination of cases is checked in turn. A place yielded by

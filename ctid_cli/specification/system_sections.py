@@ -18,7 +18,7 @@ from ctid_cli.simulation.components import is_custom
 from ctid_cli.simulation.dataset import LoopOptions
 from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.custom_sections import Kinds, custom_form
-from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.messages import Violation
 from ctid_cli.specification.sections import Options, Section, WithKey, section_for
 from ctid_cli.specification.sweeps import Variant, variants
 from ctid_cli.specification.values import ByShape, Coefficients, NotNegative, Number, OneOf, Swept, without_copies
@@ -48,7 +48,7 @@ class SystemSection(Section):
     denominator: Coefficients
     delay: Annotated[float | list[float], Swept(NotNegative)] = 0.0
 
-    def complaints(self) -> Iterator[Complaint]:
+    def violations(self) -> Iterator[Violation]:
         """Yield the reason why the system cannot be simulated."""
         with np.errstate(all="ignore"):
             model = TransferFunction(self.numerator, self.denominator)
@@ -83,7 +83,7 @@ class SubmodelSection(Section):
     denominator: Coefficients
     integrators: int = Field(default=0, ge=0)
 
-    def complaints(self) -> Iterator[Complaint]:
+    def violations(self) -> Iterator[Violation]:
         """Yield the reason why the submodel is invalid."""
         submodel = self.options()
         if not (np.isfinite(submodel.numerator).all() and np.isfinite(submodel.denominator).all()):
@@ -129,7 +129,7 @@ class AdditiveSystemSection(AdditiveSection):
 
     delay: Annotated[float | list[float], Swept(NotNegative)] = 0.0
 
-    def complaints(self) -> Iterator[Complaint]:
+    def violations(self) -> Iterator[Violation]:
         """Yield the reason why the system cannot be simulated."""
         for k, section in enumerate(self.additive):
             submodel = section.options()
@@ -326,7 +326,7 @@ class LoopSection(Section):
     reference: ExcitationSection | None = None
     enters: Annotated[Enters | list[Enters], Swept(Enters)] = "controller"
 
-    def complaints(self) -> Iterator[Complaint]:
+    def violations(self) -> Iterator[Violation]:
         """Yield a controller without any effect."""
         if any(_does_nothing(variant.options.controller) for variant in variants(self)):
             yield ("controller",), "the controller is zero, so there is no loop; give it a gain, or give excitation"
@@ -353,7 +353,7 @@ class UniformStart(Section):
 
     uniform: Annotated[list[NotNegative], Field(min_length=2, max_length=2)]
 
-    def complaints(self) -> Iterator[Complaint]:
+    def violations(self) -> Iterator[Violation]:
         """Yield the reason why the range is invalid."""
         low, high = self.uniform
         if not low < high:

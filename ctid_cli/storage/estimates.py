@@ -19,7 +19,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.errors import StorageError, UsageError
 from ctid_cli.storage import columns
-from ctid_cli.storage import folder as place
+from ctid_cli.storage import folder as folders
 from ctid_cli.storage import manifest as plans
 from ctid_cli.storage.column_arrays import ROWS, AnyArray, names_of
 from ctid_cli.storage.export import Export, export_in_memory, open_export, sha256_of
@@ -27,7 +27,7 @@ from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.journal import JournalReader
 from ctid_cli.storage.manifest import Key, Manifest, Slot
 from ctid_cli.storage.sqlite_file import EXPORT
-from ctid_cli.storage.truth import ERRORS, VALUES, Found, failures, found_under, judged
+from ctid_cli.storage.truth import ERRORS, VALUES, Found, failures, found_under, satisfied
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,7 +48,7 @@ def read_estimates(folder: Path, names: Sequence[str] | None = None) -> pd.DataF
 
 def read_stored(folder: Path) -> Estimates:
     """Return the estimates of the latest plan of an experiment."""
-    with place.reading_journal(folder) as log:
+    with folders.reading_journal(folder) as log:
         return stored_in(folder, log)
 
 
@@ -68,7 +68,7 @@ def stored_in(folder: Path, log: JournalReader | None) -> Estimates:
 
 def _times_in(folder: Path, *part: Any) -> Any:
     """Return the times stored in a journal."""
-    with place.reading_journal(folder) as log:
+    with folders.reading_journal(folder) as log:
         return {} if log is None else log.times(*part)
 
 
@@ -176,7 +176,7 @@ class Estimates:
         if name == "true_delay":
             return self._by_block(lambda block: self._truths[block.cell["hash"]].get("delay"))
         if name == "converged":
-            return [None if value != value else bool(value) for value in self.judged.tolist()]
+            return [None if value != value else bool(value) for value in self.satisfied.tolist()]
         values: list[Any] = self._span(lambda first, last: self.export.values(known[name], first, last))
         return values
 
@@ -236,11 +236,11 @@ class Estimates:
     @property
     def converged(self) -> BoolArray | None:
         """Mask of the estimates that satisfy the success rule; None unless the rule applies to all of them."""
-        found = self.judged
+        found = self.satisfied
         return None if not len(found) or np.isnan(found).any() else found.astype(bool)
 
     @cached_property
-    def judged(self) -> Array:
+    def satisfied(self) -> Array:
         """1 for estimates that satisfy the success rule, 0 for others, NaN if no rule applies."""
         found, success = np.full(len(self), np.nan), self.manifest["success"]
         if not success:
@@ -251,7 +251,7 @@ class Estimates:
             own, truth = slice(block.first, block.last), self._truths[block.cell["hash"]]
             some = {name: array if name.endswith("_names") else array[own] for name, array in arrays.items()}
             values = found_under(tuple(truth), some, block.last - block.first).values
-            hits = judged(success, truth, some, values, measures and measures[own])
+            hits = satisfied(success, truth, some, values, measures and measures[own])
             if hits is not None:
                 found[own] = hits
         return found
@@ -325,35 +325,60 @@ class Estimates:
         return frame
 
 
-# --- flat tables ----------------------------------------------------------------------------------------
+# --- text for other programs ------------------------------------------------------------------------------
 
 
-def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
-    """Return estimates as a flat table for other programs, with one number per cell."""
+def csv_lines(stored: Estimates) -> Iterator[str]:
+    """Yield the estimates as parts of a CSV file with one number in a cell, the header first."""
+    names, types, parts = list(map(str, stored.part(0, 0).frame())), _types(stored), _parts(stored)
+    for start in range(0, max(len(stored), 1), ROWS):
+        flat = flat_frame(stored.part(start, start + ROWS), names, types, parts)
+        yield str(flat.to_csv(index=False, lineterminator="\n", header=start == 0))
+
+
+def flat_frame(
+    stored: Estimates, names: Sequence[str], types: Mapping[str, Any], parts: Mapping[str, Mapping[str, int]]
+) -> pd.DataFrame:
+    """Return columns of estimates with one number in a cell; columns with several numbers are split into parts."""
     import pandas as pd
 
-    parts = {column.name: column for column in columns.COLUMNS if column.type in ("coefficients", "by name")}
-    flat: dict[str, Any] = {}
-    for name in estimates.columns:
+    frame = stored.frame([name for name in names if name not in parts], types)
+    flat: dict[str, pd.Series] = {}
+    for name in names:
         if name not in parts:
-            flat[name] = estimates[name]
-            continue
-        for part, values in _parts(parts[name], estimates[name]):
-            key, column = f"{parts[name].prefix}{part}", pd.Series(values, dtype="float64", index=estimates.index)
-            # Parameters of a model are also stored as its coefficients; other names already in use get a longer name.
-            if key in estimates.columns and key != "delay":
-                key = f"parameters.{key}"
-            flat[key] = flat[key].combine_first(column) if key in flat else column
+            flat[name] = frame[name]
+        elif parts[name]:
+            values = pd.DataFrame(stored.column(name))
+            for part, place in parts[name].items():
+                # Parameters of a model are also its coefficients; other names already in use get a longer name.
+                key = f"{name}.{part}" if part in names and part != "delay" else part
+                flat[key] = flat[key].combine_first(values[place]) if key in flat else values[place]
     return pd.DataFrame(flat)
 
 
-def _parts(column: columns.Column, cells: Iterable[Any]) -> Iterator[tuple[Any, list[float | None]]]:
-    """Yield the parts of columns with several numbers per cell, each with its values."""
-    # As mappings, coefficients are numbered from 0; the leading 1 of a denominator is omitted.
-    rows: list[Any] = [dict(enumerate(row)) if isinstance(row, list) else row or {} for row in cells]
-    found: list[Any] = column.names(rows) if column.type == "by name" else []
-    for part in found or sorted({k for row in rows for k in row if k or column.name != "denominator"}):
-        yield part, [row.get(part) for row in rows]
+def _parts(stored: Estimates) -> dict[str, dict[str, int]]:
+    """Return the names of the numbers in columns with several, those that any estimate has, with their places."""
+    found: dict[str, dict[str, int]] = {}
+    for column in columns.COLUMNS:
+        name, places = column.name, dict[str, int]()
+        if column.type == "by name" and stored.has(name):
+            there: Any = stored.column(f"{name}_present").any(axis=0)
+            places = {part: k for k, part in enumerate(stored.export.parts(name)) if there[k]}
+        elif column.type == "coefficients" and stored.has(name):
+            # The leading 1 of a denominator is left out.
+            first, longest = int(name == "denominator"), int(stored.column(f"{name}_length").max(initial=0))
+            places = {str(k): k for k in range(first, longest)}
+        if column.type in ("by name", "coefficients"):
+            found[name] = {f"{column.prefix}{part}": k for part, k in places.items()}
+    return found
+
+
+def _types(stored: Estimates) -> dict[str, Any]:
+    """Return the types of the columns of swept fields over all estimates."""
+    import pandas as pd
+
+    swept = [{**block.cell["swept"], **block.estimator["swept"]} for block in stored.blocks]
+    return {name: pd.Series([part.get(name) for part in swept]).dtype for name in plans.swept_names(stored.manifest)}
 
 
 #: Keys of every estimate in machine-readable output, in this order.
@@ -369,42 +394,6 @@ def as_object(estimate: Mapping[str, Any]) -> dict[str, Any]:
     if "parameters" in estimate:
         keys.insert(keys.index("standard_errors"), "parameters")
     return {key: estimate.get(key) for key in keys} | {key: item for key, item in estimate.items() if key not in keys}
-
-
-def csv_lines(stored: Estimates) -> Iterator[str]:
-    """Yield the estimates as lines of CSV, the header first."""
-    types = _types(stored)
-    head = _head(stored, types)
-    yield str(head.to_csv(index=False, lineterminator="\n"))
-    for start in range(0, len(stored), ROWS):
-        flat = export_rows(stored.part(start, start + ROWS).frame(types=types))
-        yield str(flat.reindex(columns=head.columns).to_csv(index=False, lineterminator="\n", header=False))
-
-
-def _head(stored: Estimates, types: Mapping[str, Any]) -> pd.DataFrame:
-    """Return an empty table with all columns that occur in the estimates."""
-    import pandas as pd
-
-    some: dict[str, Any] = dict.fromkeys(map(str, stored.part(0, 0).frame(types=types)))
-    for column in columns.COLUMNS:
-        if column.name not in some:
-            continue
-        if column.type == "by name" and stored.has(column.name):
-            there: Any = stored.column(f"{column.name}_present").any(axis=0).tolist()
-            parts = zip(stored.export.parts(column.name), there, strict=True)
-            some[column.name] = {name: 0.0 for name, one in parts if one}
-        elif column.type == "coefficients" and stored.has(column.name):
-            some[column.name] = [0.0] * max(0, int(stored.column(f"{column.name}_length").max(initial=0)))
-    whole = pd.DataFrame({name: pd.Series([value], dtype="object") for name, value in some.items()})
-    return export_rows(whole).iloc[:0]
-
-
-def _types(stored: Estimates) -> dict[str, Any]:
-    """Return the types of the columns of swept fields over all estimates."""
-    import pandas as pd
-
-    swept = [{**block.cell["swept"], **block.estimator["swept"]} for block in stored.blocks]
-    return {name: pd.Series([part.get(name) for part in swept]).dtype for name in plans.swept_names(stored.manifest)}
 
 
 def json_lines(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:

@@ -176,7 +176,7 @@ class Export:
 
     def __init__(self, file: h5py.File, path: Path) -> None:
         self.path = path
-        with saying_where(path):
+        with naming_file(path):
             if file.attrs.get("format") != KIND:
                 raise StorageError(f"{path} is an HDF5 file, but not one that 'ctid run' has written")
             require_format(path, int(file.attrs["format_version"]), FORMAT)
@@ -200,12 +200,12 @@ class Export:
 
     def parts(self, name: str) -> list[str]:
         """Return the column names of an array with several columns."""
-        with saying_where(self.path):
+        with naming_file(self.path):
             return column_arrays.decoded_texts(self._group[column_arrays.names_of(name)][()])
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> AnyArray:
         """Return some rows of an array."""
-        with saying_where(self.path):
+        with naming_file(self.path):
             return np.asarray(self._group[name][start:stop])
 
     def values(self, column: Column, start: int = 0, stop: int | None = None) -> list[Any]:
@@ -214,7 +214,7 @@ class Export:
         if not self.has(name):
             return [None] * (stop - start)
         names = self.parts(name) if column.type == "by name" else ()
-        with saying_where(self.path):
+        with naming_file(self.path):
             values = column_arrays.decoded(column, lambda ending: self._group[name + ending][start:stop], names)
         if name == "standard_errors":
             # An estimate with a model has a table of errors, which may be empty.
@@ -226,14 +226,14 @@ class Export:
         """Read the whole file, so that HDF5 verifies all checksums."""
         for item in self._group.values():
             for dataset in item.values() if isinstance(item, h5py.Group) else [item]:
-                with saying_where(self.path):
+                with naming_file(self.path):
                     for start in range(0, self.count if dataset.shape[:1] == (self.count,) else 1, column_arrays.ROWS):
                         _ = dataset[start : start + column_arrays.ROWS]
 
 
 def open_export(path: Path) -> Export:
     """Open ``runs.h5``."""
-    with saying_where(path):
+    with naming_file(path):
         if path.exists():
             require_file(path)
         try:
@@ -252,7 +252,7 @@ def sha256_of(path: Path) -> str | None:
 
 
 @contextmanager
-def saying_where(path: Path) -> Iterator[None]:
+def naming_file(path: Path) -> Iterator[None]:
     """Add to an error which file cannot be read."""
     try:
         yield

@@ -208,13 +208,13 @@ def read_fit(
     moved = [] if record is None else [record] if isinstance(record, str | os.PathLike) else list(record)
     with FIT.refusing(file):
         result = decoded(content["result"], Identification)
-        listed, judged = content["records"], content["validation"]
+        listed, validated = content["records"], content["validation"]
         _require_sources(content)
         if moved and len(moved) != len(listed):
             raise UsageError(f"{file} is of {len(listed)} records; --record names {len(moved)}")
         places = [os.fspath(each) for each in moved] if moved else [None] * len(listed)
         sources = tuple(RecordSource(FIT, file, each, place) for each, place in zip(listed, places, strict=True))
-        other = judged and RecordSource(FIT, file, judged, None if validation is None else os.fspath(validation))
+        other = validated and RecordSource(FIT, file, validated, None if validation is None else os.fspath(validation))
     if validation is not None and other is None:
         raise UsageError(f"{file} has no validation record; leave --validate out")
     for source in (*sources, *([other] if other else [])):

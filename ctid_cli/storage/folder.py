@@ -97,7 +97,7 @@ def _wait(folder: Path, deadline: float) -> None:
 
 def check_free(folder: Path, manifest: Manifest, origin: Origin | None, advice: str = ELSEWHERE) -> None:
     """Refuse a locked folder that must not be extended; without an origin, estimates of any origin are accepted."""
-    with saying_what_is_safe(folder), read_journal(folder / FILE_NAME) as log:
+    with with_recovery_advice(folder), read_journal(folder / FILE_NAME) as log:
         if log is None:
             if (folder / EXPORT).exists():
                 why = f"{EXPORT} without the {FILE_NAME} it was made from, so nothing can be added to it"
@@ -119,7 +119,7 @@ def check_free(folder: Path, manifest: Manifest, origin: Origin | None, advice: 
 def reading_journal(folder: Path) -> Iterator[JournalReader | None]:
     """Read the folder's journal, also during a run; if it is damaged, state what is safe."""
     deadline = time.monotonic() + PATIENCE
-    with saying_what_is_safe(folder), ExitStack() as stack:
+    with with_recovery_advice(folder), ExitStack() as stack:
         while not (found := _opened(folder, stack)):
             # A run is opening or closing the journal.
             _wait(folder, deadline)
@@ -157,7 +157,7 @@ def writing(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def saying_what_is_safe(folder: Path) -> Iterator[None]:
+def with_recovery_advice(folder: Path) -> Iterator[None]:
     """Add to a report of damage which data are safe."""
     try:
         yield

@@ -222,6 +222,6 @@ def git_commit(root: Path) -> str | None:
     # An installed package may lie inside another repository.
     if (root / ".git").exists():
         with suppress(OSError, subprocess.CalledProcessError):
-            asked = ["git", "-C", str(root), "rev-parse", "HEAD"]
-            return subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
+            command = ["git", "-C", str(root), "rev-parse", "HEAD"]
+            return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     return None

@@ -198,11 +198,11 @@ def slots(manifest: Manifest) -> Iterator[Slot]:
 def planned_parts(manifest: Manifest) -> Iterator[tuple[Mapping[str, Any], Mapping[str, Any], Sequence[int]]]:
     """Yield every estimator on every data cell with its data sets, in the order of the plan."""
     cells, shard = manifest["data_cells"], shard_of(manifest)
-    asked: list[Sequence[int]] = [range(cell["replicates"]) for cell in cells]
+    requested: list[Sequence[int]] = [range(cell["replicates"]) for cell in cells]
     if shard is not None:
-        asked = [[k for k in some if shard.has(number, k, len(cells))] for number, some in enumerate(asked)]
+        requested = [[k for k in some if shard.has(number, k, len(cells))] for number, some in enumerate(requested)]
     for estimator in manifest["estimators"]:
-        for cell, replicates in zip(cells, asked, strict=True):
+        for cell, replicates in zip(cells, requested, strict=True):
             if replicates:
                 yield estimator, cell, replicates
 

@@ -15,7 +15,7 @@ from math import inf
 from pathlib import Path
 
 from ctid_cli.errors import CtidError, RefusedError, UsageError
-from ctid_cli.storage import folder as place
+from ctid_cli.storage import folder as folders
 from ctid_cli.storage.estimates import Estimates
 from ctid_cli.storage.export import open_export, write_runs
 from ctid_cli.storage.identity import Origin, now, origin_differences
@@ -55,7 +55,7 @@ def find_sources(paths: Iterable[Path]) -> list[Path]:
         if (path / FILE_NAME).exists():
             inside = [path]
         else:
-            inside = [folder for folder in place.experiment_folders(path) if _SHARD.search(folder.name)]
+            inside = [folder for folder in folders.experiment_folders(path) if _SHARD.search(folder.name)]
         if not inside:
             raise UsageError(f"there are no results of shards in {path}; 'ctid run --shard 1/3' writes the first of 3")
         found |= {folder.resolve(): folder for folder in inside}
@@ -63,19 +63,19 @@ def find_sources(paths: Iterable[Path]) -> list[Path]:
 
 
 def merge_all(
-    folders: Iterable[Path], out: Path, *, allow_mixed: bool = False, partial: bool = False
+    sources: Iterable[Path], out: Path, *, allow_mixed: bool = False, partial: bool = False
 ) -> Iterator[Merged]:
     """Merge the folders of each experiment into the folder of its name."""
     experiments: dict[str, list[Path]] = defaultdict(list)
-    for folder in folders:
+    for folder in sources:
         experiments[_plan_of(folder)["experiment"]].append(folder)
     for name, places in experiments.items():
         yield merge(places, out / name, allow_mixed=allow_mixed, partial=partial)
 
 
-def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, partial: bool = False) -> Merged:
+def merge(sources: Iterable[Path], target: Path, *, allow_mixed: bool = False, partial: bool = False) -> Merged:
     """Merge folders of one experiment into a target, which may already hold some of the estimates."""
-    others = [folder for folder in folders if not (target.exists() and folder.samefile(target))]
+    others = [folder for folder in sources if not (target.exists() and folder.samefile(target))]
     if not others:
         raise UsageError(f"there is nothing to merge into {target} but itself")
     plans = {folder: _plan_of(folder) for folder in others}
@@ -83,9 +83,9 @@ def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, p
     others.sort(key=lambda folder: (shard_of(plans[folder]) or Shard(0, 0), str(folder)))
     plan = _common_plan([(folder, plans[folder]) for folder in others])
     keys = dict.fromkeys(slot.key for slot in slots(plan))
-    with _new_folder(target), place.lock(target):
-        place.check_free(target, plan, None, "merge into another folder (--out)")
-        with place.saying_what_is_safe(target):
+    with _new_folder(target), folders.lock(target):
+        folders.check_free(target, plan, None, "merge into another folder (--out)")
+        with folders.with_recovery_advice(target):
             log = open_journal(target / FILE_NAME)
         with closing(log):
             taken = _Taken(target, log, plan, keys, allow_mixed=allow_mixed)
@@ -101,7 +101,7 @@ def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, p
                 if missing and not partial:
                     raise RefusedError(f"{plan['experiment']}: {missing}. --partial merges what there is")
                 log.note_plan(plan)
-            with place.writing(target):
+            with folders.writing(target):
                 log.write_spec((others[0] / SPEC).read_bytes())
             count, checksum = write_runs(target, log)
             mixed = len(log.origins()) > 1
@@ -111,7 +111,7 @@ def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, p
 
 @contextmanager
 def _reading(folder: Path) -> Iterator[JournalReader]:
-    with place.lock(folder, shared=True), place.reading_journal(folder) as log:
+    with folders.lock(folder, shared=True), folders.reading_journal(folder) as log:
         if log is None:
             raise UsageError(f"there is no {FILE_NAME} with results in {folder}, which a merge reads")
         yield log
@@ -143,7 +143,7 @@ def _new_folder(target: Path) -> Iterator[None]:
     """Create a folder; if the enclosed code fails, remove it again unless it existed before."""
     made = not target.exists()
     try:
-        with place.writing(target):
+        with folders.writing(target):
             target.mkdir(parents=True, exist_ok=True)
         yield
     except BaseException:
@@ -190,7 +190,7 @@ class _Taken:
         differences = origin_differences(other, origin, "there", "here")
         raise RefusedError(
             f"{where} and {folder} were computed by other code or arithmetic ({differences}); run one of "
-            "them with --fresh where the other was run, or merge with --allow-mixed, which tables will say"
+            "them with --fresh where the other was run, or merge with --allow-mixed, which tables note"
         )
 
     def _is_better(self, row: Row, session: Session, present: Row, folder: Path) -> bool:
@@ -211,7 +211,7 @@ class _Taken:
             others = ", ".join(key.id for key, _, _ in self._conflicts[1:NAMED])
             more = f"; {count - 1} more differ too: {others}{', …' if count > NAMED else ''}" if others else ""
             raise RefusedError(
-                f"estimate {key.id} is one thing in {one} and another in {other}; 'ctid export --id {key.id}' prints "
+                f"estimate {key.id} differs between {one} and {other}; 'ctid export --id {key.id}' prints "
                 f"each, and --fresh computes one of the folders anew{more}"
             )
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,48 +14,25 @@ import numpy as np
 
 from ctid_cli.errors import CtidError, DamageError, UsageError
 from ctid_cli.storage import columns
-from ctid_cli.storage import folder as place
+from ctid_cli.storage import folder as folders
 from ctid_cli.storage.estimates import Estimates, read_stored, stored_in
 from ctid_cli.storage.export import open_export, sha256_of
 from ctid_cli.storage.folder import InUseError
 from ctid_cli.storage.identity import as_text
 from ctid_cli.storage.journal import JournalReader
-from ctid_cli.storage.manifest import Manifest, Slot, planned_parts, shard_of, slots
+from ctid_cli.storage.manifest import planned_parts, shard_of, slots
 from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME, RUNNING, who_runs
 from ctid_cli.written_files import is_leftover
 
-#: A data cell and an estimator by their hashes.
-Part = tuple[str, str]
-#: A plan, the numbers of its stored and failed estimates, and whether they have several origins.
-Counted = tuple[Manifest, dict[Part, tuple[int, int]], bool]
 #: Data of a run that may be published: nothing that names a machine, a user or a folder.
 PUBLIC = ("jobs", "processors", "packages")
 
 
-@dataclass(frozen=True)
-class FoundEstimate:
-    """One estimate found in its plan."""
-
-    folder: Path
-    #: This estimate only.
-    stored: Estimates
-
-    @cached_property
-    def row(self) -> dict[str, Any]:
-        """Its row."""
-        return next(self.stored.rows())
-
-    @cached_property
-    def slot(self) -> Slot:
-        """Its place in the plan."""
-        return self.stored.slot(0)
-
-
-def find_estimate(results: Path, prefix: str) -> FoundEstimate:
+def find_estimate(results: Path, prefix: str) -> Estimates:
     """Find one estimate among all experiments by a prefix of its id."""
-    matches: dict[str, FoundEstimate] = {}
+    matches: dict[str, Estimates] = {}
     in_use = ""
-    for folder in place.experiment_folders(results):
+    for folder in folders.experiment_folders(results):
         try:
             stored = read_stored(folder)
         except InUseError as error:
@@ -64,7 +40,7 @@ def find_estimate(results: Path, prefix: str) -> FoundEstimate:
             continue
         ids = stored.column("id")
         for number in np.flatnonzero(np.char.startswith(ids, prefix.encode())).tolist():
-            matches.setdefault(ids[number].decode(), FoundEstimate(folder, stored.part(number, number + 1)))
+            matches.setdefault(ids[number].decode(), stored.part(number, number + 1))
     if not matches:
         raise UsageError(f"no id in {results} begins with {prefix!r}{in_use}; 'ctid export' lists all ids")
     if len(matches) > 1:
@@ -75,7 +51,7 @@ def find_estimate(results: Path, prefix: str) -> FoundEstimate:
 
 def public_sessions(folder: Path) -> list[dict[str, Any]]:
     """Return the publishable data of the runs that computed an experiment."""
-    with place.reading_journal(folder) as log:
+    with folders.reading_journal(folder) as log:
         if log is None:
             return []
         counts, sessions = log.counts(), log.sessions()
@@ -133,7 +109,7 @@ class ExperimentStatus(Progress):
 def experiment_status(folder: Path) -> ExperimentStatus:
     """Count stored and missing estimates."""
     try:
-        with place.reading_journal(folder) as log:
+        with folders.reading_journal(folder) as log:
             running = _running(folder) if log is not None and log.live else None
             return _status(folder, log, running)
     except InUseError:
@@ -160,42 +136,41 @@ def _running(folder: Path) -> dict[str, Any]:
 
 
 def _status(folder: Path, log: JournalReader | None, running: dict[str, Any] | None) -> ExperimentStatus:
-    manifest, counted, mixed = _in_export(folder) if log is None else _in_journal(log)
-    # Estimates shared by two names are stored once in a journal.
-    left_aside = None if log is None else log.require_count() - sum(done for done, _ in counted.values())
+    #: For each estimate that is stored, by data cell and estimator, whether it failed.
+    failures: dict[tuple[str, str], Sequence[bool]] = {}
+    if log is None:
+        stored = stored_in(folder, None)
+        manifest, mixed, left_aside = stored.manifest, stored.mixed, None
+        for block in stored.blocks:
+            failures[block.cell["hash"], block.hash] = stored.failures[block.first : block.last].tolist()
+    else:
+        manifest, sessions = log.manifest(), set[str]()
+        for estimator, cell, replicates in planned_parts(manifest):
+            failures[cell["hash"], estimator["hash"]] = failed = list[bool]()
+            for row in log.rows_of(estimator, cell, replicates):
+                sessions.add(row.session)
+                failed.append(row.status in columns.FAILURES)
+        mixed = len(log.origins_of(sessions)) > 1
+        # Estimates shared by two names are stored once in a journal.
+        left_aside = log.require_count() - sum(map(len, failures.values()))
     groups = []
     for estimator, cell, replicates in planned_parts(manifest):
-        planned = len(replicates) * len(estimator["starts"])
-        found = counted.get((cell["hash"], estimator["hash"]), (0, 0))
+        own = failures.get((cell["hash"], estimator["hash"]), ())
         swept = {**cell["swept"], **estimator["swept"]}
-        groups.append(GroupStatus(planned, *found, estimator["name"], cell["hash"], swept))
-    planned, done, failed = (sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed"))
-    name, found_groups, dealt = manifest["experiment"], tuple(groups), shard_of(manifest)
-    shard = None if dealt is None else (dealt.number, dealt.of)
-    return ExperimentStatus(planned, done, failed, name, folder, left_aside, mixed, running, found_groups, shard)
-
-
-def _in_journal(log: JournalReader) -> Counted:
-    """Count the stored estimates of a journal's plan."""
-    manifest, counted, sessions = log.manifest(), dict[Part, tuple[int, int]](), set[str]()
-    for estimator, cell, replicates in planned_parts(manifest):
-        done = failed = 0
-        for row in log.rows_of(estimator, cell, replicates):
-            sessions.add(row.session)
-            done += 1
-            failed += row.status in columns.FAILURES
-        counted[cell["hash"], estimator["hash"]] = (done, failed)
-    return manifest, counted, len(log.origins_of(sessions)) > 1
-
-
-def _in_export(folder: Path) -> Counted:
-    """Count the estimates in ``runs.h5``."""
-    stored = stored_in(folder, None)
-    failures, counted = stored.failures, dict[Part, tuple[int, int]]()
-    for block in stored.blocks:
-        failed = int(failures[block.first : block.last].sum())
-        counted[block.cell["hash"], block.hash] = (block.last - block.first, failed)
-    return stored.manifest, counted, stored.mixed
+        planned = len(replicates) * len(estimator["starts"])
+        groups.append(GroupStatus(planned, len(own), sum(own), estimator["name"], cell["hash"], swept))
+    counts = {name: sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed")}
+    part = shard_of(manifest)
+    return ExperimentStatus(
+        **counts,
+        experiment=manifest["experiment"],
+        folder=folder,
+        left_aside=left_aside,
+        mixed=mixed,
+        running=running,
+        groups=tuple(groups),
+        shard=None if part is None else (part.number, part.of),
+    )
 
 
 State = Literal["intact", "damaged", "missing", "stale", "left over"]
@@ -233,7 +208,7 @@ def verify(folder: Path) -> Verification:
     """Read and check everything stored by a run."""
     live, noted, findings = False, None, []
     try:
-        with place.reading_journal(folder) as log:
+        with folders.reading_journal(folder) as log:
             if log is not None:
                 live, noted = log.live, log.exported()
                 findings.append(_journal(log))

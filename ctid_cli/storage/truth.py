@@ -156,7 +156,7 @@ def failures(arrays: Mapping[str, AnyArray]) -> BoolArray:
     return np.isin(arrays["status"], [name.encode() for name in columns.FAILURES])
 
 
-def judged(
+def satisfied(
     success: Mapping[str, Any] | None,
     truth: Mapping[str, float],
     arrays: Mapping[str, AnyArray],

@@ -6,16 +6,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.results import Results, experiments_in, find_results, out_option, read_results
 from ctid_cli.reporting.study import DEFAULT_STUDY, Study, all_studies, find_study, last_part
 from ctid_cli.text import did_you_mean
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,29 +32,6 @@ def read_study(study: Study, out: Path) -> StudyResults:
     """Return the results of a study, by the last parts of its experiments' names."""
     found = {last_part(name): find_results(out, name) for name in study.configs}
     return StudyResults(study, out, {name: results for name, results in found.items() if results is not None})
-
-
-@dataclass(frozen=True, eq=False)
-class StudyList(Result):
-    """The studies with their experiments."""
-
-    studies: Sequence[Study]
-
-    def content(self) -> list[dict[str, Any]]:
-        """Return the studies for JSON."""
-        return [{"study": each.name, "title": each.title, "experiments": dict(each.configs)} for each in self.studies]
-
-    def to_frame(self) -> pd.DataFrame:
-        """Return a row for each experiment."""
-        import pandas as pd
-
-        rows = [item for each in self.studies for item in each.configs.items()]
-        return pd.DataFrame(rows, columns=["experiment", "specification"])
-
-    def sections(self) -> list[Section]:
-        """Return the subject of each study, and the experiments of all."""
-        titles = [f"- {each.name}: {each.title}" for each in self.studies]
-        return [Section("", titles, self.to_frame(), notes=["Specifications are in configs."])]
 
 
 @dataclass(frozen=True)

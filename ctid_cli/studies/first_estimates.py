@@ -17,18 +17,17 @@ from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.plan import Plan
 from ctid_cli.written_files import write_file
 
-#: Largest difference of an estimated parameter [its standard errors]. Newton's method ends if the squared error would
-#: decrease by less than 1e-12 of itself: at most 1e-6 sqrt(N) standard errors from the optimum, 9e-5 for the 8,000
-#: samples of the longest record, in either direction. Other iterations end closer to it.
-OF_ERROR = 2e-4
-#: Largest relative difference of a standard error, a cost or a fit: their sampling deviation is below a tenth of them,
-#: so they change by less than a tenth of what the parameters change in standard errors.
-RELATIVE = 2e-5
-#: Largest difference of a measure of a track, in its unit: rounding moves frequencies of exact signals by 4e-12 rad/s.
-OF_MEASURE = 1e-9
-#: Largest difference of the share of valid samples [%]: with exact signals rounding decides when a reading becomes
-#: valid, one sample in 3,300 earlier or later.
-OF_SHARE = 0.1
+#: Largest differences by their unit:
+#:
+#: - of a parameter in standard errors: Newton's method ends if the squared error would decrease by less than 1e-12 of
+#:   itself, at most 1e-6 sqrt(N) standard errors from the optimum, 9e-5 for the 8,000 samples of the longest record, in
+#:   either direction; other iterations end closer to it;
+#: - of a standard error, a cost or a fit, relative: their sampling deviation is below a tenth of them, so they change
+#:   by less than a tenth of what the parameters change in standard errors;
+#: - of a measure of a track: rounding moves frequencies of exact signals by 4e-12 rad/s;
+#: - of the share of valid samples: with exact signals rounding decides when a reading becomes valid, one sample in
+#:   3,300 earlier or later.
+TOLERANCES = {"standard errors": 2e-4, "of its value": 2e-5, "rad/s or s": 1e-9, "% of the samples": 0.1}
 #: Compared fields of an estimate.
 QUANTITIES = (
     *("start_delay", "delay", "numerator", "denominator", "parameters", "standard_errors", "cost", "fit_percent"),
@@ -100,7 +99,7 @@ def compare(found: Estimates, committed: Estimates) -> Comparison:
     """Compare estimates with the committed ones."""
     wrong = [f"{name}: missing" for name in committed if name not in found]
     wrong += [f"{name}: not among those that were committed" for name in found if name not in committed]
-    largest: dict[_Kind, tuple[float, str]] = {}
+    largest: dict[str, tuple[float, str]] = {}
     for name in (name for name in committed if name in found):
         ours, theirs = found[name], committed[name]
         if ours["status"] != theirs["status"]:
@@ -112,37 +111,24 @@ def compare(found: Estimates, committed: Estimates) -> Comparison:
             if a is None or b is None:
                 outside.append((math.inf, f"{name}: {key} {a!r} (not {b!r})"))
                 continue
-            kind, unit = _kind_of(key, theirs["values"])
-            size = 0.0 if a == b else abs(a - b) / unit if unit else math.inf
+            unit, scale = _unit_of(key, theirs["values"])
+            size = 0.0 if a == b else abs(a - b) / scale if scale else math.inf
             # A difference of NaN counts as a disagreement.
-            if not size <= kind.allowed:
-                outside.append((size / kind.allowed, f"{name}: {key} {a!r} (not {b!r}, {size:.2g} {kind.unit} away)"))
-            if size > largest.get(kind, (0.0, ""))[0]:
-                largest[kind] = size, f"{key} of {name}"
+            if not size <= TOLERANCES[unit]:
+                outside.append((size / TOLERANCES[unit], f"{name}: {key} {a!r} (not {b!r}, {size:.2g} {unit} away)"))
+            if size > largest.get(unit, (0.0, ""))[0]:
+                largest[unit] = size, f"{key} of {name}"
         if outside:
             wrong.append(max(outside)[1])
-    said = [f"{size:.2g} {kind.unit} (allowed: {kind.allowed:g}), {where}" for kind, (size, where) in largest.items()]
-    return Comparison(sorted(wrong), sorted(said))
+    listed = [f"{size:.2g} {unit} (allowed: {TOLERANCES[unit]:g}), {where}" for unit, (size, where) in largest.items()]
+    return Comparison(sorted(wrong), sorted(listed))
 
 
-class _Kind(NamedTuple):
-    """Unit of a difference, and its tolerance."""
-
-    unit: str
-    allowed: float
-
-
-_OF_ERROR = _Kind("standard errors", OF_ERROR)
-_RELATIVE = _Kind("of its value", RELATIVE)
-_OF_MEASURE = _Kind("rad/s or s", OF_MEASURE)
-_OF_SHARE = _Kind("% of the samples", OF_SHARE)
-
-
-def _kind_of(key: str, values: Mapping[str, float]) -> tuple[_Kind, float]:
-    """Return how a number is compared, and the unit of its difference."""
+def _unit_of(key: str, values: Mapping[str, float]) -> tuple[str, float]:
+    """Return the unit in which a number is compared, and its size."""
     group, _, name = key.partition(".")
     if group == "measures":
-        return (_OF_SHARE if name == "valid_share" else _OF_MEASURE), 1.0
+        return ("% of the samples" if name == "valid_share" else "rad/s or s"), 1.0
     parameter = {"parameters": name, "denominator": f"a{name}", "numerator": f"b{name}", "delay": "delay"}.get(group)
     error = values.get(f"standard_errors.{parameter}", 0.0)
-    return (_OF_ERROR, error) if error > 0 else (_RELATIVE, abs(values[key]))
+    return ("standard errors", error) if error > 0 else ("of its value", abs(values[key]))

@@ -3,7 +3,6 @@
 import io
 import json
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -109,17 +108,15 @@ def test_a_range_of_delays_is_low_high_and_not_negative(text):
         _ = StructureOptions(delays=[text]).bounds
 
 
-def test_a_long_fit_shows_its_time_on_a_terminal(monkeypatch):
+def test_a_fit_is_announced_on_a_terminal(monkeypatch):
     class Terminal(io.StringIO):
         def isatty(self):
             return True
 
-    monkeypatch.setattr(_progress, "TIME_AFTER", 0.05)
     shown = {}
     for kind in (Terminal, io.StringIO):
         monkeypatch.setattr(sys, "stderr", kind())
         with _progress.FitProgress(1_000_000) as progress:
-            time.sleep(0.4)
             progress(1, 2)
         shown[kind] = sys.stderr.getvalue()
     assert "fitting 1000000 samples" in shown[Terminal].replace(",", "")

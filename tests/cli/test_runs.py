@@ -96,7 +96,7 @@ def test_a_stopped_run_can_be_resumed(ctid, here, number, code):
     output, errors = process.communicate(timeout=60)
     assert process.returncode == code, errors
     assert time.monotonic() - begun < 30
-    assert f"stopping ({number.name}): 5 s for what is in work; once more to stop at once" in errors
+    assert f"stopping ({number.name}): running estimates have 5 s; a second signal stops at once" in errors
     assert f"stopped by {number.name}; run the same command again" in output
     assert "unfinished" in ctid("status").stdout
 

@@ -9,7 +9,7 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 
 from ctid_cli.inference import paired
-from ctid_cli.inference.paired import bootstrap_difference, fisher, holm, mcnemar, smallest_detectable, tango_interval
+from ctid_cli.inference.paired import bootstrap_difference, fisher, holm, mcnemar, tango_interval
 
 
 def root_of_mean(squares):
@@ -93,14 +93,3 @@ def test_holm_is_the_closure_of_bonferroni():
         subsets = (s for size in range(1, 7) for s in itertools.combinations(range(6), size) if k in s)
         assert adjusted == pytest.approx(max(min(1.0, len(s) * min(p[j] for j in s)) for s in subsets))
     assert list(holm([])) == []
-
-
-@pytest.mark.parametrize(("n", "reference", "m"), [(100, 100, 100), (20, 97, 100), (300, 50, 100)])
-def test_the_detectable_difference_is_found_with_80_percent_probability(n, reference, m):
-    from scipy.stats import binom
-
-    level = 1e-3
-    drop = smallest_detectable(n, reference, m, level, rise=False)
-    q = reference / m - drop / 100
-    significant = [k for k in range(n + 1) if fisher(k, n, reference, m) < level and k / n < reference / m]
-    assert binom.pmf(significant, n, q).sum() == pytest.approx(0.8, abs=1e-6)

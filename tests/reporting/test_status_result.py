@@ -51,9 +51,10 @@ def test_the_status_of_an_experiment(make_results, estimate, snapshot):
     result = StatusResult(progress(), Path("other"), results.stored, cells)
     assert result.summary() == snapshot
     content = result.content()
-    assert [(one["status"], one["estimates"]) for one in content["outcomes"]] == [("FAILED", 11), ("CONVERGED", 1)]
-    assert len(content["failures"]) == 10
-    assert content["failures"][0]["message"] == "ValueError: singular"
+    assert [(one["status"], one["reason"], one["estimates"]) for one in content["outcomes"]] == [
+        ("FAILED", "ValueError: singular", 11),
+        ("CONVERGED", "", 1),
+    ]
     assert (content["todo"], content["precision"][1]["needed"]) == (18, 613)
 
 
@@ -85,6 +86,6 @@ def test_what_a_block_and_a_run_have_brought():
     open_, missed = cell("open", 20.0, widest=RMSE), cell("at_most", 15.0, 5000, percentage(1.1))
     assert block_sentence([cell(), open_]) == "1 of 2 data cells need more data sets, up to 613"
     assert precision_sentence([]) == precision_sentence([cell(), open_]) == ""
-    narrow = "200 to 613 data sets in each data cell: all intervals are as narrow as asked for"
+    narrow = "200 to 613 data sets in each data cell: all intervals are as narrow as requested"
     assert precision_sentence([cell(needed=200), cell()]) == narrow
     assert precision_sentence([cell(), missed]).startswith("1 of 2 data cells ended at 5000 data sets with wider")

@@ -43,7 +43,7 @@ def main() -> int:
     except CtidError as error:
         print(error, file=sys.stderr)
         return error.exit_code
-    if summary.given_up or summary.hindrance:
+    if summary.given_up or summary.cause:
         print(summary.machine_error(), file=sys.stderr)
     return summary.exit_code
 

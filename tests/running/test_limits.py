@@ -164,7 +164,7 @@ def test_a_stop_ends_what_takes_long_and_keeps_what_is_finished_of_its_data_set(
 
     def listen(progress: Progress) -> None:
         if progress.stored:
-            request.ask("a test")
+            request.request("a test")
 
     summary = run(toys(Toy("sleep", at=0), runs=2), tmp_path, stop=request, progress=listen)
     assert (summary.stopped_by, summary.computed, summary.given_up) == ("a test", 7, ())

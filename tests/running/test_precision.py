@@ -74,7 +74,7 @@ def test_neither_workers_nor_interruptions_change_a_byte(
             nonlocal seen
             seen += bool(progress.stored)
             if seen >= commits:
-                request.ask("stop")
+                request.request("stop")
 
         return run(plan(), place, jobs=jobs, stop=request, progress=listen)
 

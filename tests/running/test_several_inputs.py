@@ -11,7 +11,7 @@ from ctid_cli.running.plan import build_plan
 from ctid_cli.running.trial import load_tried
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.manifest import true_values
-from ctid_cli.storage.truth import found_of_rows, judged
+from ctid_cli.storage.truth import found_of_rows, satisfied
 
 FIRST = {
     "system": {"numerator": [2.0], "denominator": [1.0, 1.0], "delay": 0.3},
@@ -76,8 +76,8 @@ def test_a_common_denominator_is_one_in_the_truth_too():
     rule = {"delay_relative_error": 0.01, "parameter_relative_error": 0.5}
     row = data.result_of(fit, None, None)
     arrays = {"status": np.array([row["status"].encode()])}
-    assert judged(rule, truth, arrays, found.values, None).all()
-    assert not judged(rule, truth, arrays, found.values * [1, 1, 1, 1, 1.1], None).any()
+    assert satisfied(rule, truth, arrays, found.values, None).all()
+    assert not satisfied(rule, truth, arrays, found.values * [1, 1, 1, 1, 1.1], None).any()
 
 
 def test_coefficients_are_compared_by_their_power():

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import shutil
 from pathlib import Path
 from typing import Any
@@ -9,14 +10,15 @@ import pandas as pd
 import pytest
 
 from ctid_cli.errors import UsageError
+from ctid_cli.storage import estimates
 from ctid_cli.storage.columns import parameter_names
-from ctid_cli.storage.estimates import export_rows, read_estimates, read_stored
+from ctid_cli.storage.estimates import csv_lines, read_estimates, read_stored
 from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.journal import open_journal
 from ctid_cli.storage.manifest import true_values
 from ctid_cli.storage.status import experiment_status, find_estimate
-from ctid_cli.storage.truth import arrays_of_rows, found_under, judged
+from ctid_cli.storage.truth import arrays_of_rows, found_under, satisfied
 from tests.storage.made_results import plan_of
 
 MANIFEST = plan_of(5).manifest()
@@ -84,10 +86,12 @@ def test_two_names_share_their_estimates(place: Path) -> None:
 def test_an_estimate_is_found_by_the_beginning_of_its_id(place: Path) -> None:
     wanted = read_estimates(place).iloc[7]
     found = find_estimate(place.parent, wanted["id"][:8])
-    assert (found.folder, found.row["id"], found.row["delay"]) == (place, wanted["id"], wanted["delay"])
-    assert (found.row["seconds"], found.row["start"]) == (0.25, wanted["start"])
-    assert (found.slot.key.id, found.slot.estimator["kind"]) == (wanted["id"], "td_srivc")
-    assert found.slot.cell["content"]["noise"]["snr_db"] == 10.0
+    (row,), slot = found.rows(), found.slot(0)
+    assert (row["id"], row["delay"], row["seconds"], row["start"]) == (
+        *(wanted["id"], wanted["delay"], 0.25, wanted["start"]),
+    )
+    assert (slot.key.id, slot.estimator["kind"]) == (wanted["id"], "td_srivc")
+    assert slot.cell["content"]["noise"]["snr_db"] == 10.0
     with pytest.raises(UsageError, match="30 estimates"):
         find_estimate(place.parent, "")
     with pytest.raises(UsageError, match=r"no id in .* begins with 'xyz'"):
@@ -170,7 +174,7 @@ def test_success_rule(
     estimate: dict[str, Any], success: dict[str, Any] | None, truth: dict[str, float], expected: bool | None
 ) -> None:
     arrays = arrays_of_rows([estimate])
-    hits = judged(success, truth, arrays, found_under(tuple(truth), arrays, 1).values, None)
+    hits = satisfied(success, truth, arrays, found_under(tuple(truth), arrays, 1).values, None)
     assert (None if hits is None else hits.tolist()) == (None if expected is None else [expected])
 
 
@@ -209,13 +213,14 @@ def test_true_values_are_those_of_the_estimated_form() -> None:
     assert true_values({"content": {"data": {}}}) == {}
 
 
-def test_flat_tables_have_one_number_in_a_cell(place: Path) -> None:
-    flat = export_rows(read_estimates(place))
+def test_csv_has_one_number_in_a_cell(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = "".join(csv_lines(read_stored(place)))
+    flat = pd.read_csv(io.StringIO(whole))
     assert {"b0", "a1", "se_b0", "se_delay", "delay", "converged", "snr_db"} <= set(flat)
     assert not {"numerator", "denominator", "standard_errors", "a0"} & set(flat)
-    assert flat["a1"].tolist()[:4] == [2.0, 2.0, 2.0 + 1 / 3, 2.0 + 1 / 3]
-    frame = pd.DataFrame({"a1": [1], "numerator": [[1.0]], "parameters": [{"a1": 3.0, "g1_a1": 4.0}]})
-    assert export_rows(frame).iloc[0].to_dict() == {"a1": 1, "b0": 1.0, "parameters.a1": 3.0, "g1_a1": 4.0}
+    assert flat["a1"].tolist()[:4] == pytest.approx([2.0, 2.0, 2.0 + 1 / 3, 2.0 + 1 / 3])
+    monkeypatch.setattr(estimates, "ROWS", 7)
+    assert "".join(csv_lines(read_stored(place))) == whole
 
 
 def test_names_of_parameters_have_one_order() -> None:

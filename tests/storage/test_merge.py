@@ -115,7 +115,7 @@ def test_two_results_of_one_estimate_are_named_and_nothing_is_written(parts: lis
     copy = run_folder(shard(1), tmp_path / "copy", [*others, *changed])
     target = run_folder(shard(2) | {"shard": [2, 3]}, tmp_path / "toys")
     before = files(target)
-    with pytest.raises(RefusedError, match=r"is one thing in .* and another in .*; 1 more differ too") as refused:
+    with pytest.raises(RefusedError, match=r"differs between .* and .*; 1 more differ too") as refused:
         merge([*parts, copy], target)
     assert all(outcome.key.id in str(refused.value) for outcome in changed)
     assert files(target) == before

@@ -27,14 +27,14 @@ CROWDED = 16
 REACH = 3.0
 
 
-def box_drawing(results: Results, asked: Sequence[str] = ()) -> Drawing:
+def box_drawing(results: Results, parameters: Sequence[str] = ()) -> Drawing:
     """Return box plots of the errors of each parameter: quartiles, 5 and 95 %, the median with its 95 % interval."""
     errors = results.errors.dropna(subset="value")
     known = errors["parameter"].unique().tolist()
-    for name in asked:
+    for name in parameters:
         if name not in known:
             raise UsageError(f"no estimator has the parameter {name!r}; there are {', '.join(known)}")
-    names = (list(asked) or known)[:PANELS]
+    names = (list(parameters) or known)[:PANELS]
     settings, rows = placed(label_frame(results).loc[sorted(set(results.errors["group"]))], results)
     boxes = rows[["method", "place"]].merge(errors, left_index=True, right_on="group")
     labels = ["\n".join(map(value_text, point)) for point in settings.points]

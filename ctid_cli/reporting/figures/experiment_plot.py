@@ -7,7 +7,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.reporting.figures.estimate_plot import box_drawing
 from ctid_cli.reporting.figures.measure_plot import measure_drawing
 from ctid_cli.reporting.figures.style import Drawing, require_kind
-from ctid_cli.reporting.measures import asked_measures, default_measures
+from ctid_cli.reporting.measures import default_measures, requested_measures
 from ctid_cli.reporting.results import Results
 
 Kind = Literal["measure", "box"]
@@ -18,7 +18,7 @@ def kinds_of(results: Results) -> list[Kind]:
     if not len(results.stored):
         raise UsageError(f"{results.experiment} has no stored estimates yet; run it first")
     if results.settings.get("data") is not None:
-        one = f"{results.experiment} is about one measured record, so that there is nothing to draw over data sets"
+        one = f"{results.experiment} has one measured record, and these figures show several data sets"
         raise UsageError(f"{one}; ctid fit draws a fit")
     kinds: list[Kind] = ["measure"]
     if results.is_simulated:
@@ -29,11 +29,11 @@ def kinds_of(results: Results) -> list[Kind]:
 
 def main_measure(results: Results) -> str:
     """Return the default measure: that of the specification, its rule of success, or the errors."""
-    asked = asked_measures(results)
-    if not asked and results.settings.get("success"):
+    named = requested_measures(results)
+    if not named and results.settings.get("success"):
         return "percent"
     # The root mean square error, the last one, is more informative than the bias.
-    return next(reversed(default_measures(results) if not asked else asked[:1]), "cpu")
+    return next(reversed(default_measures(results) if not named else named[:1]), "cpu")
 
 
 def chosen_kind(results: Results, kind: str | None = None, measure: str | None = None) -> Kind:
@@ -43,7 +43,7 @@ def chosen_kind(results: Results, kind: str | None = None, measure: str | None =
         return "measure" if measure is not None else known[0]
     require_kind(kind, get_args(Kind))
     if kind not in known:
-        raise UsageError(f"{results.experiment} has nothing to draw as {kind}; it has {', '.join(known)}")
+        raise UsageError(f"{results.experiment} has no figure of kind {kind}; it has {', '.join(known)}")
     return kind
 
 

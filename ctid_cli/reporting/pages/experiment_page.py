@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 import ctid_cli
@@ -17,7 +16,7 @@ from ctid_cli.reporting.pages.page import Chapter, write_page
 from ctid_cli.reporting.pages.question import formula_of, references
 from ctid_cli.reporting.paired_result import compare_estimators
 from ctid_cli.reporting.results import Results, out_option
-from ctid_cli.reporting.status_result import first_line
+from ctid_cli.reporting.status_result import outcome_frame
 from ctid_cli.reporting.surprises import surprises
 from ctid_cli.reporting.table_result import experiment_table, measure_table, notes_of, success_sentence
 from ctid_cli.storage.sqlite_file import SPEC
@@ -78,7 +77,7 @@ def _question(results: Results) -> Iterator[Section]:
         text = (results.folder / SPEC).read_text(encoding="utf-8")
     except OSError:
         return
-    where, same = (" beside its record", "") if seed is None else ("", ": the same seed gives the same data sets")
+    where, same = (" next to its record", "") if seed is None else ("", ": the same seed gives the same data sets")
     yield Section("The specification", [f"Save it as a file{where} and run `ctid run FILE`{same}.", text + "\n"])
 
 
@@ -117,25 +116,20 @@ def _comparisons(results: Results, out: Path) -> Iterator[Section]:
 
 def _outcomes(results: Results, out: Path) -> list[Section]:
     """Return the outcomes of unsuccessful estimates, with the command that shows one of them."""
-    rows = results.stored
-    well = np.isin(rows.column("status"), [status.encode() for status in SUCCESSES])
-    failed = list(rows.chosen(~well).rows("estimator", "status", "message", "id"))
     notes = [f"Note: {note}" for note in notes_of(results, out)]
-    if not failed:
+    outcomes = outcome_frame(results.stored)
+    listed = outcomes[~outcomes["status"].isin(SUCCESSES)].head(FAILURES_LISTED)
+    if listed.empty:
         return [Section(sentences=["Nothing: every estimate ended as it should."], notes=notes)]
-    frame = pd.DataFrame([{**row, "reason": first_line(row["message"])} for row in failed])
-    groups = frame.groupby(["estimator", "status", "reason"], sort=False)["id"].agg(["size", "first"]).reset_index()
-    listed = groups.sort_values("size", ascending=False, kind="stable").head(FAILURES_LISTED)
-    listed["first"] = [f"`ctid export {results.experiment} --id {id}{out_option(out)}`" for id in listed["first"]]
-    columns = {"size": "estimates", "first": "the first of them"}
-    return [Section(frame=listed.rename(columns=columns), notes=notes)]
+    commands = [f"`ctid export {results.experiment} --id {id}{out_option(out)}`" for id in listed["first"]]
+    return [Section(frame=listed.assign(first=commands).rename(columns={"first": "the first of them"}), notes=notes)]
 
 
 def _provenance(results: Results, sessions: list[dict[str, Any]]) -> Iterator[Section]:
     """Yield the origin of the results."""
     seed = results.manifest["seed"]
-    sown = "" if seed is None else f", seed {seed}"
-    made = f"Specification {results.manifest['spec_hash'][:16]}{sown}; page by ctid {ctid_cli.__version__}."
+    of_seed = "" if seed is None else f", seed {seed}"
+    made = f"Specification {results.manifest['spec_hash'][:16]}{of_seed}; page by ctid {ctid_cli.__version__}."
     origins = [(each.code_version, each.platform, _versions(dict(each.packages))) for each in results.stored.origins]
     yield Section(sentences=[made], frame=pd.DataFrame(origins, columns=["code version", "platform", "libraries"]))
     if sessions:

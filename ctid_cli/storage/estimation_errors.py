@@ -1,4 +1,4 @@
-"""Estimates by data cell, estimator and start, and their parameter errors, as tidy tables.
+"""Groups of estimates, by data cell, estimator and start, and errors of parameters, poles and responses.
 
 Every estimate with a value for each parameter of the system counts, converged or not. An estimate that failed, or has
 no value in these parameters, has no error.
@@ -6,17 +6,22 @@ no value in these parameters, has no error.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.errors import UsageError
 from ctid_cli.inference import monte_carlo
+from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.models.distances import h2_distance, hinf_distance, matched_poles, response_distance
+from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.several_inputs import is_delay
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.storage.estimates import Estimates
-from ctid_cli.storage.manifest import Manifest, true_values
+from ctid_cli.storage.manifest import Manifest, true_system, true_values
 from ctid_cli.storage.truth import Found
 
 if TYPE_CHECKING:
@@ -24,17 +29,19 @@ if TYPE_CHECKING:
 
 #: Columns of parameter errors.
 COLUMNS = ("group", "parameter", "replicate", "true", "value", "standard_error", "quantile")
+#: Distance of an estimated model from the simulated one.
+Distance = Callable[[TransferFunction, TransferFunction], float]
 
 
 def planned_groups(manifest: Manifest) -> pd.DataFrame:
     """Return the planned groups, numbered from 0: data cell and estimator by their places in the plan, and start."""
     import pandas as pd
 
-    cells, estimators = (range(len(manifest[part])) for part in ("data_cells", "estimators"))
     rows = [
-        (cell, estimator, start)
-        for cell, estimator in itertools.product(cells, estimators)
-        for start in manifest["estimators"][estimator]["starts"]
+        (cell, number, start)
+        for cell in range(len(manifest["data_cells"]))
+        for number, estimator in enumerate(manifest["estimators"])
+        for start in estimator["starts"]
     ]
     return pd.DataFrame(rows, columns=["cell", "estimator", "start"])
 
@@ -60,6 +67,9 @@ def places_of(numbers: IndexArray) -> dict[int, IndexArray]:
     order = np.argsort(numbers, kind="stable")
     groups, first = np.unique(numbers[order], return_index=True)
     return dict(zip(groups.tolist(), np.split(order, first[1:]), strict=True)) if len(order) else {}
+
+
+# --- parameters -----------------------------------------------------------------------------------------------------
 
 
 def error_frame(stored: Estimates, numbers: IndexArray) -> pd.DataFrame:
@@ -90,6 +100,25 @@ def error_frame(stored: Estimates, numbers: IndexArray) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=COLUMNS)
 
 
+def _given_delays(
+    groups: pd.DataFrame, truths: Sequence[dict[str, float]], found: dict[int, Found]
+) -> set[tuple[int, str]]:
+    """Return the places of estimators with the names of the delays that they do not estimate."""
+    delays: dict[tuple[int, str], list[Array]] = {}
+    for number, (values, errors, _) in found.items():
+        cell, estimator = groups.iloc[number, :2].tolist()
+        for k, name in enumerate(truths[cell]):
+            if is_delay(name):
+                delays.setdefault((estimator, name), []).append(np.array([values[:, k], errors[:, k]]))
+    given = set()
+    for place, parts in delays.items():
+        values, errors = np.hstack(parts)
+        known = values[np.isfinite(values)]
+        if np.isnan(errors).all() and (known == known[:1]).all():
+            given.add(place)
+    return given
+
+
 def errors_of_group(
     number: int,
     replicates: IndexArray,
@@ -116,20 +145,47 @@ def errors_of_group(
     return pd.DataFrame(dict(zip(COLUMNS, columns, strict=True)))
 
 
-def _given_delays(
-    groups: pd.DataFrame, truths: Sequence[dict[str, float]], found: dict[int, Found]
-) -> set[tuple[int, str]]:
-    """Return the places of estimators with the names of the delays that they do not estimate."""
-    delays: dict[tuple[int, str], list[Array]] = {}
-    for number, (values, errors, _) in found.items():
-        cell, estimator = groups.iloc[number, :2].tolist()
-        for k, name in enumerate(truths[cell]):
-            if is_delay(name):
-                delays.setdefault((estimator, name), []).append(np.array([values[:, k], errors[:, k]]))
-    given = set()
-    for place, parts in delays.items():
-        values, errors = np.hstack(parts)
-        known = values[np.isfinite(values)]
-        if np.isnan(errors).all() and (known == known[:1]).all():
-            given.add(place)
-    return given
+# --- poles and responses ----------------------------------------------------------------------------------------------
+
+
+def system_of(cell: Mapping[str, Any], name: str) -> TransferFunction:
+    """Return the simulated system of a data cell as one fraction, for a measure that needs it."""
+    system = true_system(cell)
+    model = unfactored(system) if isinstance(system, AdditiveModel) else system
+    if not isinstance(model, TransferFunction):
+        what = "with one input that is simulated"
+        raise UsageError(f"{name} needs a linear system of poles and zeros {what}, and there is none here")
+    if name in ("h2", "hinf") and not model.is_stable:
+        raise UsageError(f"{name} is infinite for a system that integrates; use response:FREQUENCY")
+    return model
+
+
+def distances(system: TransferFunction, rows: Estimates, name: str) -> Array:
+    """Return the distances of estimates for a measure [%]; infinite if there is no model."""
+    base, _, argument = name.partition(":")
+    known: dict[str, Distance] = {"h2": h2_distance, "hinf": hinf_distance}
+    distance = partial(response_distance, frequency=float(argument)) if base == "response" else known[base]
+    models = rows.rows("numerator", "denominator", "delay")
+    return np.array([100.0 * distance(system, _model(row)) if row["denominator"] else np.inf for row in models])
+
+
+def _model(row: Mapping[str, Any]) -> TransferFunction:
+    return TransferFunction(row["numerator"], row["denominator"], max(row["delay"] or 0.0, 0.0))
+
+
+def pole_errors(group: int, system: TransferFunction, rows: Estimates) -> pd.DataFrame:
+    """Return pole errors in the form of parameter errors, each with the matched true pole [rad/s].
+
+    Names are ``pole_1`` ..., fastest first; ``pole_1_real`` and ``pole_1_imag`` for complex pairs. A model with another
+    number of poles has no errors.
+    """
+    true = system.poles
+    found = np.array([true, *(matched_poles(true, denominator) for denominator in rows.values("denominator"))])
+    columns: dict[str, Array] = {}
+    for number, k in enumerate(np.flatnonzero(true.imag >= 0).tolist(), start=1):
+        if true[k].imag:
+            columns |= {f"pole_{number}_real": found[:, k].real, f"pole_{number}_imag": found[:, k].imag}
+        else:
+            columns[f"pole_{number}"] = found[:, k].real
+    values = np.column_stack([*columns.values()])
+    return errors_of_group(group, rows.column("replicate"), [*columns], values[0], values[1:])
