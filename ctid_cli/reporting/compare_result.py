@@ -28,8 +28,8 @@ TESTS = (("white", "whiteness_p_value"), ("uncorrelated", "cross_p_value"))
 VERDICTS = [key for pair in TESTS for key in pair]
 #: Meaning of the columns of the table.
 MEANING = (
-    "fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x. white, independent: whether the residuals "
-    "are white, and independent of the input; p is the probability of residuals farther from that."
+    "fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x. white, independent: whether tests of the "
+    "residuals accept that they are white, and independent of the input; p are the p-values of the tests."
 )
 
 
@@ -68,10 +68,8 @@ class ModelComparison(Result):
     def sections(self) -> list[Section]:
         """Return the models, the best fit first, and the samples on which they are compared."""
         record, one, unit = self.measurement.record, self.found[0], self.units
-        every = "all" if one.count == record.n_samples else f"{one.count} of"
-        samples = (
-            f"{record.name}: {every} {record.n_samples} samples, from {one.t[0]:.6g} to {one.t[-1]:.6g} {unit.time}"
-        )
+        used = "all" if one.count == record.n_samples else f"{one.count} of"
+        samples = f"{record.name}: all models use {used} {record.n_samples} samples, from {one.t[0]:.6g} to "
         rows = [row | {test: _verdict(row[test], row[p]) for test, p in TESTS} for row in self._rows()]
         columns = (
             Column("name", "model"),
@@ -87,7 +85,7 @@ class ModelComparison(Result):
         )
         best_first = sorted(rows, key=lambda row: -row["fit_percent"])
         return [
-            Section(sentences=[f"{samples}, the same for all models."]),
+            Section(sentences=[f"{samples}{one.t[-1]:.6g} {unit.time}."]),
             Section.table(best_first, columns, notes=[MEANING], drawing=self.drawing()),
         ]
 

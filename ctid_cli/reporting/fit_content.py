@@ -33,7 +33,7 @@ from ctid_cli.signals.record import Record
 DERIVED = (
     Column("name", "derived"),
     Column("estimate"),
-    Column("standard_error", "standard error", ".3g"),
+    Column("standard_error", "std error", ".3g"),
     Column("low", "95 % low"),
     Column("high", "95 % high"),
     Column("unit"),

@@ -29,9 +29,8 @@ ROWS = 12
 #: Mark of a structure that cannot be chosen, and its meaning.
 NO_CANDIDATE = "no"
 ABOUT_NO_CANDIDATE = (
-    "- Not to be chosen (no): the data do not determine the parameters; or a pair is held at the least damping or the "
-    "greatest frequency that is admitted, where it follows this record's noise; or a smaller structure predicts blocks "
-    "of the record that it did not see far better."
+    "- no: not a candidate. The data do not determine its parameters, or a pair of poles is at the bound of damping or "
+    "frequency and fits the noise of this record, or a smaller structure predicts held-back blocks far better."
 )
 STRUCTURE = ("poles", "zeros", "integrators")
 #: Columns that identify a sum of second-order submodels.
