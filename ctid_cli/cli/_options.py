@@ -68,7 +68,8 @@ def given_options(*groups: Any) -> list[str]:
     for group in groups:
         types = get_type_hints(type(group), include_extras=True)
         given = [option.name for option in fields(group) if getattr(group, option.name) != option.default]
-        found += [types[name].__metadata__[0].param_decls[0] for name in given]
+        # Typer takes the first argument of an annotated option, its name, as the default.
+        found += [types[name].__metadata__[0].default for name in given]
     return found
 
 

@@ -49,7 +49,7 @@ class WritingOptions:
 
 
 @dataclass(frozen=True)
-class JudgingOptions:
+class AssessmentOptions:
     """Options for the assessment of the fit."""
 
     validate: Validate = None
@@ -91,7 +91,7 @@ def fit(
     columns: RecordOptions,
     form: FormatOptions,
     writing: WritingOptions,
-    judging: JudgingOptions,
+    assessment: AssessmentOptions,
 ) -> None:
     """Fit a transfer function to records or a frequency response.
 
@@ -100,12 +100,12 @@ def fit(
     criterion unless they are given. A table of a frequency response, such as ctid frf writes, needs --poles.
     """
     request = ModelRequest(model, loop, columns.names)
-    read = [*files, *([judging.validate] if judging.validate else [])]
+    read = [*files, *([assessment.validate] if assessment.validate else [])]
     refuse_overwriting(read, [writing.out / "fit.json", *([writing.csv / "step.csv"] if writing.csv else [])])
     if frequency_files(files):
-        result: FitResult = frequency_fit(files, request, columns, judging)
+        result: FitResult = frequency_fit(files, request, columns, assessment)
     else:
-        result = _fit_of_records(files, request, columns, judging)
+        result = _fit_of_records(files, request, columns, assessment)
     contents = writing.contents(result, given_command(context))
     refuse_overwriting(read, [*contents])
     write_files(contents)
@@ -113,22 +113,22 @@ def fit(
 
 
 def _fit_of_records(
-    files: list[Path], request: ModelRequest, columns: RecordOptions, judging: JudgingOptions
+    files: list[Path], request: ModelRequest, columns: RecordOptions, assessment: AssessmentOptions
 ) -> FitResult:
     """Fit a model to records in time, with a progress bar if it takes long."""
     from ctid_cli.identification.identify import identify
     from ctid_cli.reporting.fit_result import FitResult
 
     noise, loop = request.options.noise, request.loop
-    judging.check(noise, {})
+    assessment.check(noise, {})
     loop.check()
     estimator = request.estimator()
     if request.single and len(files) > 1:
         raise UsageError(f"{len(files)} files are given, and a record in a loop is fitted alone; give one file")
     hold = "zoh" if request.hold == "auto" else request.hold
-    records = columns.read_all(files, judging.validate, hold, reference=loop.reference).treated(loop.applied)
-    judging.check(noise, {record.name: record.n_samples for record in records.all})
+    records = columns.read_all(files, assessment.validate, hold, reference=loop.reference).treated(loop.applied)
+    assessment.check(noise, {record.name: record.n_samples for record in records.all})
     with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)) as progress:
-        draws = judging.draws | {"progress": progress, "time_unit": records.units.time}
+        draws = assessment.draws | {"progress": progress, "time_unit": records.units.time}
         found = identify(records.data, estimator, records.validation_record, **draws)
-    return FitResult(found, records.of_fit(found), judging.predict)
+    return FitResult(found, records.of_fit(found), assessment.predict)

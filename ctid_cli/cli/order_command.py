@@ -3,35 +3,58 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from ctid_cli.canonical import plain
 from ctid_cli.cli._common import emit, guarded, span, write_files
-from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag, refuse_options
+from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag, given_options, refuse_options
 from ctid_cli.cli._progress import FitProgress
 from ctid_cli.cli.fit_structure import MODES, OPTIONS, FormOption, HoldOption, StructureOptions, as_usage_errors
 from ctid_cli.cli.response_fit import frequency_files
 from ctid_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from ctid_cli.identification.choice import Given
 
 #: Options of the other form of the model, and what to do.
 FRACTION = {"--modes": "add --model additive, or drop it"}
 SUM = dict.fromkeys(("--poles", "--zeros"), "give the numbers of submodels by --modes, or drop it")
 
 
+@dataclass(frozen=True)
+class GridOptions(StructureOptions):
+    """Structures that are compared, and the hold of the input."""
+
+    poles: Annotated[str | None, flag("--poles", "Numbers of poles, 1 to 12; else chosen.", "LOW:HIGH")] = None
+    zeros: Annotated[str | None, flag("--zeros", "Numbers of zeros.", "LOW:HIGH")] = None
+    model: FormOption = "fraction"
+    modes: Annotated[str | None, flag("--modes", "Numbers of second-order submodels of a sum.", "LOW:HIGH")] = None
+    hold: HoldOption = "auto"
+
+    def requested(self) -> Given:
+        """Return the given options of the choice; a UsageError names contradicting options."""
+        is_sum = self.model == "additive"
+        refuse_options(given_options(self), SUM if is_sum else FRACTION, f"--model {self.model}")
+        for name in ("delay_bounds", "integrators"):
+            if self.each(name).keys() - {""}:
+                only = "INPUT=VALUE is for ctid fit; structures are ranked with one for all inputs"
+                raise UsageError(f"{OPTIONS[name]} {only}")
+        return self.given(
+            poles=_range("--poles", self.poles, int(not self.common("integrators"))),
+            zeros=_range("--zeros", self.zeros, 0),
+            modes=_range("--modes", self.modes, *MODES) or MODES if is_sum else None,
+            hold=self.hold,
+        )
+
+
 @guarded
 def order(
     files: Records,
-    structure: StructureOptions,
+    grid: GridOptions,
     columns: RecordOptions,
     form: FormatOptions,
-    poles: Annotated[str | None, flag("--poles", "Numbers of poles, 1 to 12; else as many as needed.", "LOW:HIGH")] = (
-        None
-    ),
-    zeros: Annotated[str | None, flag("--zeros", "Numbers of zeros.", "LOW:HIGH")] = None,
-    model: FormOption = "fraction",
-    modes: Annotated[str | None, flag("--modes", "Numbers of second-order submodels of a sum.", "LOW:HIGH")] = None,
-    hold: HoldOption = "auto",
     validate: Validate = None,
     out: Annotated[Path, flag("--out", "Folder for order.json and order.svg.", "DIR")] = Path("."),
 ) -> None:
@@ -48,21 +71,7 @@ def order(
         raise UsageError(
             f"{files[0]} is a frequency response: its structure is given, not chosen; use ctid fit --poles"
         )
-    ranges = {"--poles": poles, "--zeros": zeros, "--modes": modes}
-    is_sum = model == "additive"
-    typed = [option for option, text in ranges.items() if text is not None]
-    refuse_options(typed, SUM if is_sum else FRACTION, "a sum of submodels" if is_sum else "one fraction")
-    for name in ("delay_bounds", "integrators"):
-        if structure.each(name).keys() - {""}:
-            raise UsageError(
-                f"{OPTIONS[name]} INPUT=VALUE is for ctid fit; structures are ranked with one for all inputs"
-            )
-    given = structure.given(
-        poles=_range("--poles", poles, int(not structure.common("integrators"))),
-        zeros=_range("--zeros", zeros, 0),
-        modes=_range("--modes", modes, *MODES) or MODES if is_sum else None,
-        hold=hold,
-    )
+    given = grid.requested()
     records = columns.read_all(files, validate, "zoh")
     with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)):
         choice = choose(records.data, given, records.units.time)

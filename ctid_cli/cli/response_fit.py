@@ -54,7 +54,7 @@ def frequency_files(files: Sequence[Path]) -> list[Path]:
 
 
 def frequency_fit(
-    files: Sequence[Path], request: ModelRequest, columns: RecordOptions, judging: object
+    files: Sequence[Path], request: ModelRequest, columns: RecordOptions, assessment: object
 ) -> FrequencyFitResult:
     """Fit a model to the given frequency response; a UsageError for options that do not apply to one."""
     from ctid_cli.estimators.frequency_domain import FrequencyDomain
@@ -64,7 +64,7 @@ def frequency_fit(
 
     if len(files) > 1:
         raise UsageError(f"{len(files)} files are given, and a frequency response is fitted by itself; give one file")
-    given = given_options(request.options, request.loop, columns, judging)
+    given = given_options(request.options, request.loop, columns, assessment)
     refuse_options(given, OF_RECORDS, f"a frequency response ({files[0]})")
     options = request.options.with_delays()
     poles, zeros, integrators = (options.common(name) for name in ("poles", "zeros", "integrators"))

@@ -126,8 +126,8 @@ class FitResult(PagedResult):
     def page_head(self) -> tuple[str, str]:
         """Return the title of the page, and the quality of the simulation."""
         fit, validation = self.fitted.fit, self.fitted.validation
-        structure = "; ".join(f"{name} {spelled(own)}".strip() for name, own in self._structures()) + self.lost_poles
-        lead = f"{structure}. Fit {number(fit.fit_percent, 4)} % on {count(fit.count, 'sample')}"
+        structure = "; ".join(f"{name}: {spelled(own)}" if name else spelled(own) for name, own in self._structures())
+        lead = f"{structure}{self.lost_poles}. Fit {number(fit.fit_percent, 4)} % on {count(fit.count, 'sample')}"
         if validation is not None:
             common = self.fitted.seen_in_validation
             shared = f" ({count(common, 'sample')} of it also used for the estimation)" if common else ""
@@ -180,7 +180,7 @@ class FitResult(PagedResult):
         below = [row.name for row in rows if POSITIVE.search(row.name) and row.low < 0.0]
         if below:
             notes.append(
-                f"Too large an error for a linearised interval, which contains negative values: {listed(below)}."
+                f"The linearised intervals of {listed(below)} contain negative values: the errors are too large."
             )
         return Section.table(rows, DERIVED, notes=notes)
 
@@ -238,7 +238,7 @@ class FitResult(PagedResult):
             yield "validation", f"{text}, {count(validation.count, 'sample')}; with its own initial state and offset"
             for k in self.predicted:
                 assert fit.noise is not None
-                yield "", f"{number(validation.prediction_fit(fit.noise, k), 5)} % of its {_horizon(k)}"
+                yield "", _prediction(k, validation.prediction_fit(fit.noise, k))
         what = "mean squared output error" if fit.weighting is None else "twice the mean loss"
         yield "cost", f"{units.amount(number(fit.cost), units.square)}, {what}"
         per = "cost" if fit.noise is None else "var e"
@@ -282,7 +282,7 @@ class FitResult(PagedResult):
         variance = units.amount(number(estimate.noise.innovation_variance or 0.0), units.square)
         yield "noise", f"ARMA({p},{q}){chosen}: {estimate.formula}; variance of e {variance}"
         for k in self.predicted:
-            yield "", f"{number(fit.prediction_fit(k), 5)} % of {_horizon(k)}"
+            yield "", _prediction(k, fit.prediction_fit(k))
         yield "output error", f"fit {number(estimate.output_error_fit, 5)} % without the noise model"
         if estimate.test.freedom:
             yield "", f"its difference from this fit: {probability(estimate.test.p_value)} by Hausman's test"
@@ -307,8 +307,8 @@ def _shown(record: Record | Validation) -> str:
     return shown(record.name) or "a record"
 
 
-def _horizon(k: int) -> str:
-    return f"predictions {count(k, 'sample')} ahead"
+def _prediction(k: int, fit_percent: float) -> str:
+    return f"fit {number(fit_percent, 5)} % of predictions {count(k, 'sample')} ahead"
 
 
 def _searched(options: Options, units: Units) -> str:

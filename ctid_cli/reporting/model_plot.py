@@ -104,7 +104,7 @@ def inputs_drawing(figures: FitFigures) -> Drawing:
             step, gain = figure.add_subplot(grid[row : row + 2, 0]), figure.add_subplot(grid[row, 1])
             draw_step(step, model.step_response(), units)
             draw_bode(gain, figure.add_subplot(grid[row + 1, 1], sharex=gain), model.frequency_response(), units)
-            for axes, what in ((step, "step of"), (gain, "response to")):
+            for axes, what in ((step, "unit step response to"), (gain, "frequency response to")):
                 axes.set_title(plain(f"{what} {name}"), loc="left")
 
     return Drawing(8.0, 3.4 * n + 2.8 + 3.2 * len(models), draw)
@@ -168,12 +168,12 @@ def figure_chapters(figures: FitFigures, main: Drawing, validation: Measurement 
     """Return the figures of a page: the main one, responses, poles, and the cost about the delay."""
     result, units = figures.result, figures.units
     outcome, more = result.validation, len(figures.measurements) - MOST_DRAWN
-    several = len(models_of(result)) > 1
-    what = "responses to each input" if several else "search over the delay"
-    found = [Section(drawing=main, caption=f"Output, {result.fit.left_over}, their correlation, and {what}.")]
+    several, left = len(models_of(result)) > 1, result.fit.left_over
+    what = "responses to each input" if several else "the search over the delay"
+    found = [Section(drawing=main, caption=f"Output, residuals, autocorrelation of the {left}, and {what}.")]
     found += [Section(sentences=[f"{more} more experiments are not drawn."])] if more > 0 else []
     if result.tests and not several:
-        caption = f"Correlation of the {result.fit.left_over} with the {result.driver}."
+        caption = f"Correlation of the {left} with the {result.driver}."
         found.append(Section(drawing=figures.cross_correlation(), caption=caption))
     found.append(Section(notes=[test.sentence for test in result.tests]))
     if outcome is not None and validation is not None:
