@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pandas as pd
 
 from ctid_cli.inference.monte_carlo_tests import FEWEST
-from ctid_cli.reporting.document import Column, Result, Section
+from ctid_cli.reporting.document import Column, Result, Section, aligned_lines
 from ctid_cli.reporting.layout import setting_text, setting_title
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.surprises import surprises
@@ -110,12 +110,12 @@ def _tables(estimates: Sequence[Mapping[str, Any]]) -> Iterator[Section]:
         rows = [{"samples": each["samples"], **parameter} for parameter in each["parameters"]]
         if rows:
             tables.setdefault((_words(each["settings"]), _title(each)), []).extend(rows)
-    titles: dict[tuple[str, str], list[str]] = {}
+    same: dict[tuple[str, str], tuple[Section, list[str]]] = {}
     for (where, title), rows in tables.items():
-        titles.setdefault((where, repr(rows)), []).append(title)
-    for (where, _), names in titles.items():
-        title = f"{listed(names)}: standard errors{where and f' at {where}'}"
-        yield Section.table(tables[where, names[0]], COLUMNS, title=title)
+        table = Section.table(rows, COLUMNS)
+        same.setdefault((where, repr(aligned_lines(table))), (table, []))[1].append(title)
+    for (where, _), (table, titles) in same.items():
+        yield replace(table, title=f"{listed(titles)}: standard errors{where and f' at {where}'}")
 
 
 def _formula(formula: str, entries: pd.DataFrame) -> str:
