@@ -260,7 +260,7 @@ class FitResult(PagedResult):
             yield "status", fit.status.value
         if fit.starts is not None:
             tried, agree = fit.starts
-            yield "search", f"best of {count(tried, 'start')}; {agree} of them converged to it"
+            yield "search", f"best of {count(tried, 'start')}" + f", reached from {agree} of them" * (tried > 1)
         for name, end in fit.bounds_met:
             yield "at bound", f"{name} = {end:g}, as given"
         at_box = fit.held_poles or (fit.status in (Status.AT_BOUND, Status.RIDGE) and not fit.bounds_met)
