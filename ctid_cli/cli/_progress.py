@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from typing import TYPE_CHECKING, Any, Self
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 LINE_EVERY = 10.0
 #: Seconds before the bar of a single record appears: most finish sooner.
 BAR_AFTER = 1.0
+#: Seconds before a fit shows its elapsed time.
+TIME_AFTER = 2.0
 
 
 class _Progress:
@@ -90,26 +93,39 @@ class RecordProgress(_Progress):
 
 
 class FitProgress(RecordProgress):
-    """Elapsed time of a fit on a terminal; then the draws of a bootstrap."""
+    """Elapsed time of a fit, on a terminal and if it takes long; then the draws of a bootstrap."""
 
     def __init__(self, samples: int) -> None:
         super().__init__("bootstrap", "the draws")
         self._fitting = f"fitting {count(samples, 'sample')}"
+        self._timer = threading.Timer(TIME_AFTER, self._show_time)
 
     def __enter__(self) -> Self:
         if sys.stderr.isatty():
-            from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
-
-            shown = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-            self._show(self._fitting, *shown, transient=True)
+            self._timer.start()
         return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stop_time()
 
     def __call__(self, done: int, total: int) -> None:
         """Show the number of draws done."""
         if done == 1:
-            self.__exit__()
-            self._bar = None
+            self._stop_time()
         super().__call__(done, total)
+
+    def _show_time(self) -> None:
+        from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
+
+        shown = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+        self._show(self._fitting, *shown, transient=True)
+
+    def _stop_time(self) -> None:
+        self._timer.cancel()
+        if self._timer.ident is not None:
+            self._timer.join()
+        super().__exit__()
+        self._bar = None
 
 
 class Reporter(_Progress):

@@ -3,6 +3,7 @@
 import io
 import json
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import typer
 from scipy.signal import lfilter
 
 from ctid_cli import Record, load_fit
-from ctid_cli.cli._progress import FitProgress
+from ctid_cli.cli import _progress
 from ctid_cli.cli.fit_structure import delay_range
 from tests.cli.records import rows, write
 
@@ -113,10 +114,12 @@ def test_a_long_fit_shows_its_time_on_a_terminal(monkeypatch):
         def isatty(self):
             return True
 
+    monkeypatch.setattr(_progress, "TIME_AFTER", 0.05)
     shown = {}
     for kind in (Terminal, io.StringIO):
         monkeypatch.setattr(sys, "stderr", kind())
-        with FitProgress(1_000_000) as progress:
+        with _progress.FitProgress(1_000_000) as progress:
+            time.sleep(0.4)
             progress(1, 2)
         shown[kind] = sys.stderr.getvalue()
     assert "fitting 1000000 samples" in shown[Terminal].replace(",", "")
