@@ -357,8 +357,8 @@ class ModelRequest:
         options, by_reference = self.options, self.loop.use == "reference"
         model = "a sum of submodels in a loop" if self.is_sum else "a record in a loop"
         purpose = "the reference as an instrument" if by_reference else model
-        named = self.is_sum or (by_reference and options.common("integrators"))
-        refuse_options(given, LOOP | ({} if named else ONE_FRACTION_IN_LOOP), purpose)
+        has_submodels = self.is_sum or (by_reference and options.common("integrators"))
+        refuse_options(given, LOOP | ({} if has_submodels else ONE_FRACTION_IN_LOOP), purpose)
         if options.terms is None and options.common("poles") is None:
             option = "--reference" if by_reference or self.is_sum else "--loop"
             raise UsageError(f"{'--terms' if self.is_sum else '--poles'} is missing: with {option} it must be given")
