@@ -62,8 +62,6 @@ TREATMENTS = {
 POSITIVE = re.compile("time_constant|natural_frequency")
 #: Significant digits of the coefficients in the equation.
 DIGITS = 5
-#: Most instants of outliers in the text.
-MOST_NAMED = 5
 #: Effect of a loss on the listed samples, and its name.
 LITTLE = {"huber": "less than half their weight", "tukey": "no weight"}
 LOSSES = {"huber": "Huber's", "tukey": "Tukey's biweight"}
@@ -380,15 +378,9 @@ def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record]
     text = f"{LOSSES[kind]} (--loss {kind}), standard deviation {deviation} from the median absolute error"
     total = sum(each.size for each in times)
     samples = f"{total} of {count(fit.count, 'sample')} {'has' if total == 1 else 'have'} {LITTLE[kind]}"
-    if not total:
-        return f"{text}; {samples}"
-    listed = []
-    for k, each in enumerate(times, start=1):
-        where = f" of experiment {k}" if len(records) > 1 else ""
-        some = ", ".join(f"{t:.6g}" for t in each[:MOST_NAMED]) + (", ..." if each.size > MOST_NAMED else "")
-        listed += [f"{some} {units.time}{where}"] * (each.size > 0)
-    without = number(weighting.fit_percent(records, fit.used, fit.residuals), 5)
-    return f"{text}; {samples}, at {'; '.join(listed)}; fit {without} % without them"
+    if total:
+        samples += f"; fit {number(weighting.fit_percent(records, fit.used, fit.residuals), 5)} % without them"
+    return f"{text}; {samples}"
 
 
 def _tested(test: ResidualTests) -> str:
