@@ -130,7 +130,9 @@ def hold_name(text: str) -> AskedHold:
 
 def input_level(text: str) -> InputBefore:
     """Return the input before a record."""
-    return "first" if text == "first" else finite(text)
+    with contextlib.suppress(typer.BadParameter):
+        return "first" if text == "first" else finite(text)
+    raise typer.BadParameter(f"must be a finite number, or first; got {text!r}")
 
 
 # --- options ---------------------------------------------------------------------------------------
@@ -338,7 +340,9 @@ class ModelRequest:
         options, given = self.options, given_options(self.options, self.loop)
         if self.inputs:
             refuse_options(given, SEVERAL_INPUTS, "several inputs")
-        refuse_options(given, SUM if self.is_sum else FRACTION, "a sum of submodels" if self.is_sum else "one fraction")
+        refuse_options(
+            given, SUM if self.is_sum else FRACTION, "a sum of submodels" if self.is_sum else "one transfer function"
+        )
         refuse_options(given, {"--weight": "samples have equal weights; drop it"}, "a record in time")
         for option in ("poles", "zeros", "delay_bounds", "integrators", "hold"):
             for name in {*options.each(option)} - {"", *self.inputs}:
@@ -347,7 +351,7 @@ class ModelRequest:
         if options.common("integrators") and options.offset in ("remove", "drift"):
             raise UsageError(
                 f"--offset {options.offset} does not go with --integrators, since the output of an integrating system "
-                "has no mean or slope of its own; give another --offset"
+                f"has no mean or slope of its own; use --offset {'none' if self.single else 'estimate'}"
             )
         if self.single:
             self._check_loop(given)
