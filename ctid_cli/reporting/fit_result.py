@@ -14,7 +14,7 @@ import pandas as pd
 
 from ctid_cli.errors import StorageError
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, MultiInputFit
-from ctid_cli.estimators.identification import Identification, Options, Validation, models_of
+from ctid_cli.estimators.identification import Identification, Options, models_of
 from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
 from ctid_cli.identification.sentences import spelled
@@ -129,8 +129,10 @@ class FitResult(PagedResult):
         if validation is not None:
             common = self.fitted.seen_in_validation
             shared = f" ({count(common, 'sample')} of it also used for the estimation)" if common else ""
-            lead += f"; {number(validation.fit_percent, 4)} % on the validation record {_shown(validation)}{shared}"
-        return f"Fit of {', '.join(map(_shown, self.records.data))}", f"{lead}. {fit.status.value}"
+            lead += (
+                f"; {number(validation.fit_percent, 4)} % on the validation record {_shown(validation.name)}{shared}"
+            )
+        return f"Fit of {', '.join(_shown(record.name) for record in self.records.data)}", f"{lead}. {fit.status.value}"
 
     def chapters(self) -> Iterator[Chapter]:
         """Return data, model and figures."""
@@ -232,7 +234,9 @@ class FitResult(PagedResult):
         if fit.noise is not None:
             yield from self._noise(fit.noise)
         if validation is not None:
-            text = f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on {_shown(validation)}"
+            text = (
+                f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on {_shown(validation.name)}"
+            )
             yield "validation", f"{text}, {count(validation.count, 'sample')}; with its own initial state and offset"
             for k in self.predicted:
                 assert fit.noise is not None
@@ -300,9 +304,9 @@ def _titled_list(title: str, texts: Sequence[str]) -> Section:
     return Section(title, [f"- {text}" for text in texts]) if texts else Section()
 
 
-def _shown(record: Record | Validation) -> str:
+def _shown(name: str) -> str:
     """Return the name of a record without its folder."""
-    return shown(record.name) or "a record"
+    return shown(name) or "a record"
 
 
 def _prediction(k: int, fit_percent: float) -> str:
