@@ -36,6 +36,7 @@ from ctid_cli.reporting.pages.question import formula
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import Hold
 from ctid_cli.storage.fit_file import fit_text
 from ctid_cli.text import count, listed, probability
 from ctid_cli.written_files import write_file
@@ -44,7 +45,7 @@ FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"
 R2_DEFINITION = "1 - ||y - x||^2 / ||y - mean y||^2"
 
 #: Hold of the input, in words.
-HOLDS = {
+HOLDS: dict[Hold, str] = {
     "zoh": "constant between its samples",
     "foh": "straight lines between its samples",
     "band-limited": "without power above the Nyquist frequency",
@@ -194,9 +195,10 @@ class FitResult(PagedResult):
         yield "initial state", f"{TREATMENTS[options.initial_state]}{_before(self.fitted)}"
         yield "offset", f"{_offset(self.fitted, units)} (--offset {options.offset})"
         record = first.record
-        for text in record.hold_options:
-            of, _, hold = text.rpartition("=")
-            yield f"input {of}" if of else "inputs" if record.several else "input", f"{HOLDS[hold]} (--hold {text})"
+        for text, signal in zip(record.hold_options, record.held.values(), strict=False):
+            of, _, _ = text.rpartition("=")
+            label = f"input {of}" if of else "inputs" if record.several else "input"
+            yield label, f"{HOLDS[signal.hold]} (--hold {text})"
         if fit.weighting is not None:
             yield "loss", _loss_text(fit, fit.weighting, self.records.data, units)
 
