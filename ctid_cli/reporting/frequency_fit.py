@@ -156,8 +156,8 @@ class FrequencyFitResult(FitResult):
 
 def frequency_fit_drawing(fit: FrequencyDomainFit, units: Units) -> Drawing:
     """Return a figure of gain and phase of values and model, and the residuals with the standard errors."""
-    data, positive = fit.data, fit.data.frequencies > 0.0
-    w, values, model = data.frequencies[positive], data.response[positive], fit.answers(data.frequencies)[positive]
+    data, seen = fit.data, fit.data.frequencies > 0.0
+    w, values, model = data.frequencies[seen], data.response[seen], fit.answers(data.frequencies)[seen]
     angle = np.unwrap(np.angle(model))
     near = angle + np.angle(values * np.exp(-1j * angle))
     panels = ((decibels(np.abs(values)), decibels(np.abs(model))), (np.rad2deg(near), np.rad2deg(angle)))
@@ -168,7 +168,7 @@ def frequency_fit_drawing(fit: FrequencyDomainFit, units: Units) -> Drawing:
             axes.semilogx(w, measured, ".", color=MIDDLE, markersize=3, label="values")
             axes.semilogx(w, fitted, color=DARK, linewidth=1.2, label="model")
         if data.standard_error is not None:
-            level = decibels(data.standard_error[positive])
+            level = decibels(data.standard_error[seen])
             lowest = float(np.min(level)) - 20.0
             error.fill_between(w, lowest, level, color=BAND, linewidth=0.0, label="standard error")
             error.set_ylim(bottom=lowest)
