@@ -1,6 +1,7 @@
 """The documentation's Python examples print what the pages show."""
 
 import dataclasses
+import json
 import re
 import subprocess
 import sys
@@ -32,6 +33,22 @@ def test_examples_print_what_is_shown(page):
             [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT, timeout=300
         )
         assert done.stdout == shown
+
+
+def keys_of(schema):
+    """Yield the keys of all objects of a JSON Schema."""
+    parts = schema if isinstance(schema, list) else schema.values() if isinstance(schema, dict) else []
+    if isinstance(schema, dict):
+        yield from schema.get("properties", {})
+    for part in parts:
+        yield from keys_of(part)
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "docs" / "schemas").glob("*.json")), ids=lambda file: file.stem)
+def test_every_key_of_printed_json_is_documented(file):
+    pages = (page.read_text(encoding="utf-8") for page in (ROOT / "docs").glob("*.md"))
+    code = " ".join(re.findall(r"`([^`\n]+)`", "\n".join(pages)))
+    assert {*keys_of(json.loads(file.read_text(encoding="utf-8")))} <= {*re.findall(r"\w+", code)}
 
 
 #: Sources of the tables of docs/signals.md.

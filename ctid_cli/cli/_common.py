@@ -101,7 +101,7 @@ def given_command(context: typer.Context) -> str:
             continue
         name = [max(option.opts, key=len)] if option.param_type_name == "option" else []
         for each in value if isinstance(value, list | tuple) else [value]:
-            words += name if each is True else [*name, str(getattr(each, "value", each))]
+            words += name if each is True else [*name, str(each)]
     return shlex.join(words)
 
 

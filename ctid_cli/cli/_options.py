@@ -9,7 +9,7 @@ import contextlib
 import functools
 import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -60,6 +60,24 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
 def flag(name: str, help: str, metavar: str | None = None, **more: Any) -> Any:
     """Return the declaration of an option."""
     return typer.Option(name, help=help, metavar=metavar, **more)
+
+
+def given_options(*groups: Any) -> list[str]:
+    """Return the names of the options of some groups that differ from their defaults."""
+    found = []
+    for group in groups:
+        types = get_type_hints(type(group), include_extras=True)
+        given = [option.name for option in fields(group) if getattr(group, option.name) != option.default]
+        # Typer takes the first argument of an annotated option, its name, as the default.
+        found += [types[name].__metadata__[0].default for name in given]
+    return found
+
+
+def refuse_options(given: Iterable[str], remedies: Mapping[str, str], purpose: str) -> None:
+    """Refuse the first given option that is not available for a purpose, with the remedy."""
+    for option in given:
+        if option in remedies:
+            raise UsageError(f"{option} is not available for {purpose}; {remedies[option]}")
 
 
 def finite(text: str) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +13,7 @@ import typer
 from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwriting, write_files
 from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag
 from ctid_cli.cli._progress import FitProgress
-from ctid_cli.cli.fit_structure import Asked, FitOptions, LoopOptions, ModelOptions, as_usage_errors, options_of
+from ctid_cli.cli.fit_structure import FitOptions, LoopOptions, ModelRequest, as_usage_errors
 from ctid_cli.cli.response_fit import frequency_files, frequency_fit
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Tool
@@ -49,7 +49,7 @@ class WritingOptions:
 
 
 @dataclass(frozen=True)
-class JudgingOptions:
+class AssessmentOptions:
     """Options for the assessment of the fit."""
 
     validate: Validate = None
@@ -86,13 +86,12 @@ class JudgingOptions:
 def fit(
     context: typer.Context,
     files: Records,
-    model: ModelOptions,
+    model: FitOptions,
     loop: LoopOptions,
-    treatment: FitOptions,
     columns: RecordOptions,
     form: FormatOptions,
     writing: WritingOptions,
-    judging: JudgingOptions,
+    assessment: AssessmentOptions,
 ) -> None:
     """Fit a transfer function to records or a frequency response.
 
@@ -100,13 +99,13 @@ def fit(
     integrators, the range of the delay, the hold of the input, and the treatment of state and offset are chosen by one
     criterion unless they are given. A table of a frequency response, such as ctid frf writes, needs --poles.
     """
-    asked = Asked(model, treatment, loop.use, columns.names)
-    read = [*files, *([judging.validate] if judging.validate else [])]
+    request = ModelRequest(model, loop, columns.names)
+    read = [*files, *([assessment.validate] if assessment.validate else [])]
     refuse_overwriting(read, [writing.out / "fit.json", *([writing.csv / "step.csv"] if writing.csv else [])])
     if frequency_files(files):
-        result: FitResult = frequency_fit(files, asked, loop, columns, asdict(judging))
+        result: FitResult = frequency_fit(files, request, columns, assessment)
     else:
-        result = _fit_of_records(files, asked, loop, columns, judging)
+        result = _fit_of_records(files, request, columns, assessment)
     contents = writing.contents(result, given_command(context))
     refuse_overwriting(read, [*contents])
     write_files(contents)
@@ -114,21 +113,22 @@ def fit(
 
 
 def _fit_of_records(
-    files: list[Path], asked: Asked, loop: LoopOptions, columns: RecordOptions, judging: JudgingOptions
+    files: list[Path], request: ModelRequest, columns: RecordOptions, assessment: AssessmentOptions
 ) -> FitResult:
     """Fit a model to records in time, with a progress bar if it takes long."""
     from ctid_cli.identification.identify import identify
     from ctid_cli.reporting.fit_result import FitResult
 
-    judging.check(asked.treatment.noise, {})
+    noise, loop = request.options.noise, request.loop
+    assessment.check(noise, {})
     loop.check()
-    options = options_of(asked)
-    if asked.single and len(files) > 1:
+    estimator = request.estimator()
+    if request.single and len(files) > 1:
         raise UsageError(f"{len(files)} files are given, and a record in a loop is fitted alone; give one file")
-    hold = "zoh" if asked.hold == "auto" else asked.hold
-    records = columns.read_all(files, judging.validate, hold, reference=loop.reference).treated(loop.applied)
-    judging.check(asked.treatment.noise, {record.name: record.n_samples for record in records.all})
+    hold = "zoh" if request.hold == "auto" else request.hold
+    records = columns.read_all(files, assessment.validate, hold, reference=loop.reference).treated(loop.applied)
+    assessment.check(noise, {record.name: record.n_samples for record in records.all})
     with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)) as progress:
-        draws = judging.draws | {"progress": progress, "time_unit": records.units.time}
-        found = identify(records.data, options, records.validation_record, **draws)
-    return FitResult(found, records.of_fit(found), judging.predict)
+        draws = assessment.draws | {"progress": progress, "time_unit": records.units.time}
+        found = identify(records.data, estimator, records.validation_record, **draws)
+    return FitResult(found, records.of_fit(found), assessment.predict)

@@ -3,43 +3,58 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from ctid_cli.canonical import plain
 from ctid_cli.cli._common import emit, guarded, span, write_files
-from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag
+from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag, given_options, refuse_options
 from ctid_cli.cli._progress import FitProgress
-from ctid_cli.cli.fit_structure import (
-    MODES,
-    FormOption,
-    HoldOption,
-    ModelForm,
-    StructureOptions,
-    TreatmentOptions,
-    as_usage_errors,
-    given_of,
-    per_input,
-)
+from ctid_cli.cli.fit_structure import MODES, OPTIONS, FormOption, HoldOption, StructureOptions, as_usage_errors
 from ctid_cli.cli.response_fit import frequency_files
 from ctid_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from ctid_cli.identification.choice import Given
+
+#: Options of the other form of the model, and what to do.
+FRACTION = {"--modes": "add --model additive, or drop it"}
+SUM = dict.fromkeys(("--poles", "--zeros"), "give the numbers of submodels by --modes, or drop it")
+
+
+@dataclass(frozen=True)
+class GridOptions(StructureOptions):
+    """Structures that are compared, and the hold of the input."""
+
+    poles: Annotated[str | None, flag("--poles", "Numbers of poles, 1 to 12; else chosen.", "LOW:HIGH")] = None
+    zeros: Annotated[str | None, flag("--zeros", "Numbers of zeros.", "LOW:HIGH")] = None
+    model: FormOption = "fraction"
+    modes: Annotated[str | None, flag("--modes", "Numbers of second-order submodels of a sum.", "LOW:HIGH")] = None
+    hold: HoldOption = "auto"
+
+    def requested(self) -> Given:
+        """Return the given options of the choice; a UsageError names contradicting options."""
+        is_sum = self.model == "additive"
+        refuse_options(given_options(self), SUM if is_sum else FRACTION, f"--model {self.model}")
+        for name in ("delay_bounds", "integrators"):
+            if self.each(name).keys() - {""}:
+                only = "INPUT=VALUE is for ctid fit; structures are ranked with one for all inputs"
+                raise UsageError(f"{OPTIONS[name]} {only}")
+        return self.given(
+            poles=_range("--poles", self.poles, int(not self.common("integrators"))),
+            zeros=_range("--zeros", self.zeros, 0),
+            modes=_range("--modes", self.modes, *MODES) or MODES if is_sum else None,
+            hold=self.hold,
+        )
 
 
 @guarded
 def order(
     files: Records,
-    structure: StructureOptions,
-    treatment: TreatmentOptions,
+    grid: GridOptions,
     columns: RecordOptions,
     form: FormatOptions,
-    poles: Annotated[str | None, flag("--poles", "Numbers of poles, 1 to 12; else as many as needed.", "LOW:HIGH")] = (
-        None
-    ),
-    zeros: Annotated[str | None, flag("--zeros", "Numbers of zeros.", "LOW:HIGH")] = None,
-    model: FormOption = "fraction",
-    modes: Annotated[str | None, flag("--modes", "Numbers of second-order submodels of a sum.", "LOW:HIGH")] = None,
-    hold: HoldOption = "auto",
     validate: Validate = None,
     out: Annotated[Path, flag("--out", "Folder for order.json and order.svg.", "DIR")] = Path("."),
 ) -> None:
@@ -56,14 +71,7 @@ def order(
         raise UsageError(
             f"{files[0]} is a frequency response: its structure is given, not chosen; use ctid fit --poles"
         )
-    _refuse_other_form(model, poles=poles, zeros=zeros, modes=modes)
-    for option, texts in (("--delay", structure.delays), ("--integrators", structure.each_integrators)):
-        if per_input(option, texts).keys() - {""}:
-            raise UsageError(f"{option} INPUT=VALUE is for ctid fit; structures are ranked with one for all inputs")
-    ranges = _range("--poles", poles, int(not structure.integrators)), _range("--zeros", zeros, 0)
-    given = replace(given_of(structure, treatment, hold), poles=ranges[0], zeros=ranges[1])
-    if model == "additive":
-        given = replace(given, modes=_range("--modes", modes, *MODES) or MODES)
+    given = grid.requested()
     records = columns.read_all(files, validate, "zoh")
     with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)):
         choice = choose(records.data, given, records.units.time)
@@ -72,17 +80,6 @@ def order(
     content = json.dumps(plain({**result.json_content(), "written": list(map(str, written))}), allow_nan=False)
     write_files({written[0]: content.encode() + b"\n", written[1]: result.drawing().saved()})
     emit(result, form.form, written)
-
-
-def _refuse_other_form(model: ModelForm, **options: str | None) -> None:
-    own = {"fraction": ("poles", "zeros"), "additive": ("modes",)}
-    why = {
-        "fraction": "is for a sum of submodels; add --model additive, or drop it",
-        "additive": "is for one transfer function; give the numbers of submodels by --modes, or drop it",
-    }
-    for name, text in options.items():
-        if text is not None and name not in own[model]:
-            raise UsageError(f"--{name} {why[model]}")
 
 
 def _range(name: str, text: str | None, least: int, most: int = 12) -> tuple[int, int] | None:

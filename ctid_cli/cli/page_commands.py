@@ -65,9 +65,9 @@ def _draw_experiment(
     from ctid_cli.reporting.results import read_results
 
     results = read_results(out, name)
-    asked, measure, names = chosen
+    given_kind, measure, names = chosen
     parameters = names.split(",") if names else []
-    kind = chosen_kind(results, asked, measure)
+    kind = chosen_kind(results, given_kind, measure)
     drawing = experiment_drawing(results, kind, measure, parameters)
     stem = "_".join(re.sub(r"[^\w.]+", "-", word) for word in (kind, measure, *parameters) if word)
     form = style or _form_of(file)

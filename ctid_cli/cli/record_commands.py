@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -112,8 +112,25 @@ def _record(fit: StoredFit, file: Path, columns: RecordOptions, hold: Hold | Non
     return found
 
 
-#: The option of each method.
-OPTIONS = {"periodic": "--period", "local-polynomial": "--width", "welch": "--segment"}
+@dataclass(frozen=True)
+class MethodOptions:
+    """Method of estimating a frequency response, and its settings."""
+
+    method: Annotated[ResponseMethod, flag("--method", "How the response is estimated.")] = "auto"
+    period: Annotated[int | None, flag("--period", "Period of the input, if not found.", "SAMPLES", min=2)] = None
+    width: Annotated[int | None, flag("--width", "Half-width of the local polynomials.", "LINES", min=4)] = None
+    segment: Annotated[int | None, flag("--segment", "Length of Welch's segments.", "SAMPLES", min=1)] = None
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the method, which one of its settings implies, and the settings; refuse those of two methods."""
+        settings = {"periodic": self.period, "local-polynomial": self.width, "welch": self.segment}
+        given = [method for method, value in settings.items() if value is not None]
+        if given and (len(given) > 1 or self.method not in ("auto", given[0])):
+            raise UsageError(
+                "--period is for --method periodic, --width for local-polynomial, and --segment for welch; give one"
+            )
+        method = given[0] if given else self.method
+        return {"method": method, "period": self.period, "half_width": self.width, "segment": self.segment}
 
 
 @guarded
@@ -124,14 +141,7 @@ def frf(
     ],
     columns: RecordOptions,
     form: FormatOptions,
-    method: Annotated[ResponseMethod, flag("--method", "How the response is estimated.")] = "auto",
-    period: Annotated[
-        int | None, flag("--period", "Period of the input, if it is not found.", "SAMPLES", min=2)
-    ] = None,
-    width: Annotated[int | None, flag("--width", "Half-width of the local polynomials.", "LINES", min=4)] = None,
-    segment: Annotated[
-        int | None, flag("--segment", "Length of the segments of Welch's method.", "SAMPLES", min=1)
-    ] = None,
+    estimation: MethodOptions,
     hold: Annotated[Hold, flag("--hold", "The input between its samples.")] = "zoh",
     out: Annotated[Path, flag("--out", "Folder for frf.csv and frf.svg.", "DIR")] = Path("."),
 ) -> None:
@@ -147,28 +157,9 @@ def frf(
 
     written = [out / "frf.csv", out / "frf.svg"]
     refuse_overwriting(files, written)
-    method = _method(method, period, width, segment)
+    arguments = estimation.arguments()
     records = columns.read_all(files, None, hold)
-    found = estimate_frequency_response(
-        records.data,
-        method=method,
-        period=period,
-        half_width=width,
-        segment=segment,
-        time_unit=records.units.time,
-    )
+    found = estimate_frequency_response(records.data, time_unit=records.units.time, **arguments)
     result = FrequencyResponseResult(found, records)
     write_files({written[0]: frame_bytes(result.to_frame()), written[1]: result.drawing().saved()})
     emit(result, form.form, written)
-
-
-def _method(method: ResponseMethod, period: int | None, width: int | None, segment: int | None) -> ResponseMethod:
-    """Return the method of the given options, and refuse those of two methods."""
-    values: dict[ResponseMethod, int | None] = {"periodic": period, "local-polynomial": width, "welch": segment}
-    owners = [owner for owner, value in values.items() if value is not None]
-    for owner in owners:
-        if method not in ("auto", owner):
-            raise UsageError(f"{OPTIONS[owner]} belongs to --method {owner}, not to {method}")
-    if len(owners) > 1:
-        raise UsageError(f"--period, --width and --segment belong to different methods: {' and '.join(owners)}")
-    return owners[0] if owners else method

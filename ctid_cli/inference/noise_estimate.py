@@ -124,11 +124,6 @@ class NoiseEstimate:
         """Whether the estimates of the plant differ significantly."""
         return self.test.p_value < LEVEL
 
-    def error_ratios(self, covariance: Array) -> Array:
-        """Return the standard errors of the output-error fit over those of the joint one; NaN if undefined."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(self.output_error_errors / np.sqrt(np.diag(covariance)))
-
     def prediction_errors(self, errors: Sequence[Array], used: Sequence[BoolArray], ahead: int) -> list[Array]:
         """Return the ``ahead``-step prediction errors from output errors."""
         each = zip(sampled(self.noise, used), errors, strict=True)

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from ctid_cli.inference.monte_carlo_tests import FEWEST
-from ctid_cli.reporting.document import Result, Section, aligned_lines
+from ctid_cli.reporting.document import Column, Result, Section, aligned_lines
 from ctid_cli.reporting.layout import setting_text, setting_title
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.surprises import surprises
@@ -19,8 +19,17 @@ from ctid_cli.text import count, listed
 
 #: Assumptions of all standard errors.
 REMARK = (
-    "This is to first order in the noise, where the estimator converges to the right solution; it takes the noise to "
-    "be as specified and the system to be at rest, and does not count initial states and offsets."
+    "Valid to first order in the noise, if the estimator converges to the right solution. The noise is taken as "
+    "specified, and the system as initially at rest; estimated initial states and offsets are not included."
+)
+#: Columns of the tables.
+COLUMNS = (
+    Column("samples", "N"),
+    Column("name", "parameter"),
+    Column("value", "true value"),
+    Column("standard_error", "std error", ".3g"),
+    Column("relative_percent", "rel. %", ".3g"),
+    Column("half_width_95", "half width", ".3g"),
 )
 
 
@@ -51,22 +60,20 @@ class AccuracyResult(Result):
 
     def sections(self) -> list[Section]:
         """Return tables of standard errors, their formulas, and unexpected results."""
-        frame = pd.DataFrame(self.estimates).assign(
-            where=[_words(each["settings"]) for each in self.estimates], title=[_title(each) for each in self.estimates]
-        )
+        frame = pd.DataFrame(self.estimates).assign(title=[_title(each) for each in self.estimates])
         frame = frame.reindex(columns=list(dict.fromkeys([*frame, "formula", "reason"])))
         unknown = frame.groupby("reason", sort=False)["title"]
-        paragraphs = [f"{listed(titles)}: no theory: {reason}." for reason, titles in unknown]
+        paragraphs = [f"{listed(titles)}: no standard errors: {reason}." for reason, titles in unknown]
         paragraphs += [_formula(str(formula), own) for formula, own in frame.groupby("formula", sort=False)]
         if self.left_out:
             more = count(self.left_out, "further combination")
             paragraphs.append(
                 f"Not shown: {more} of swept settings and numbers of samples; --set gives a key one value."
             )
-        head = f"{self.experiment}: standard errors to expect by theory. The half width is 1.96 of them, for 95 %."
+        head = f"{self.experiment}: standard errors by theory. Half width of a 95 % interval: 1.96 standard errors."
         return [
             Section("", [head]),
-            *_tables(frame.dropna(subset="formula")),
+            *_tables(self.estimates),
             *(Section("", [paragraph]) for paragraph in paragraphs),
             self._surprises(),
             Section("", [REMARK]),
@@ -74,7 +81,7 @@ class AccuracyResult(Result):
 
     def _surprises(self) -> Section:
         if self.surprises is None:
-            few = f"The stored estimates are not compared with theory: that takes {FEWEST} data sets of a setting."
+            few = f"Stored estimates are compared with theory only from {FEWEST} data sets of a setting on."
             return Section("", [few] if self.data_sets else [])
         if not self.surprises:
             agree = f"The stored estimates are as expected; those of fewer than {FEWEST} data sets are not compared."
@@ -96,25 +103,19 @@ class AccuracyResult(Result):
         return {**head, "estimates": self.estimates, "surprises": self.surprises}
 
 
-def _tables(known: pd.DataFrame) -> Iterator[Section]:
-    """Yield one table for each estimator and setting, and one for estimators of the same accuracy."""
+def _tables(estimates: Sequence[Mapping[str, Any]]) -> Iterator[Section]:
+    """Yield a table for each setting, one for all estimators with the same standard errors."""
+    tables: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for each in estimates:
+        rows = [{"samples": each["samples"], **parameter} for parameter in each["parameters"]]
+        if rows:
+            tables.setdefault((_words(each["settings"]), _title(each)), []).extend(rows)
     same: dict[tuple[str, str], tuple[Section, list[str]]] = {}
-    for (where, title), members in known.groupby(["where", "title"], sort=False):
-        table = _table(members.sort_values("samples", kind="stable").to_dict("records"))
-        same.setdefault((str(where), repr(aligned_lines(table))), (table, []))[1].append(str(title))
+    for (where, title), rows in tables.items():
+        table = Section.table(rows, COLUMNS)
+        same.setdefault((where, repr(aligned_lines(table))), (table, []))[1].append(title)
     for (where, _), (table, titles) in same.items():
         yield replace(table, title=f"{listed(titles)}: standard errors{where and f' at {where}'}")
-
-
-def _table(entries: Sequence[Mapping[Any, Any]]) -> Section:
-    """Return parameters down and numbers of samples across; the last columns are for the greatest number."""
-    last = pd.DataFrame(entries[-1]["parameters"])
-    columns: dict[str, Any] = {"parameter": last["name"], "true value": last["value"]}
-    columns |= {f"N = {e['samples']}": [row["standard_error"] for row in e["parameters"]] for e in entries}
-    columns |= {"relative [%]": last["relative_percent"].astype(float), "half width": last["half_width_95"]}
-    formats = {name: ".3g" for name in columns if name != "true value"}
-    note = [f"relative, half width: of {entries[-1]['samples']} samples."] if len(entries) > 1 else []
-    return Section(frame=pd.DataFrame(columns), formats=formats, notes=note)
 
 
 def _formula(formula: str, entries: pd.DataFrame) -> str:

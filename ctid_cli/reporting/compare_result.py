@@ -19,6 +19,7 @@ from ctid_cli.reporting.fit_plot import curve
 from ctid_cli.reporting.layout import picked
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.storage.fit_file import StoredFit
+from ctid_cli.text import probability
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,8 +29,8 @@ TESTS = (("white", "whiteness_p_value"), ("uncorrelated", "cross_p_value"))
 VERDICTS = [key for pair in TESTS for key in pair]
 #: Meaning of the columns of the table.
 MEANING = (
-    "fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x. white, independent: whether the residuals "
-    "are white, and independent of the input; p is the probability of residuals farther from that."
+    "fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x. white, independent: whether tests of the "
+    "residuals accept that they are white, and independent of the input, with their p-values."
 )
 
 
@@ -68,26 +69,22 @@ class ModelComparison(Result):
     def sections(self) -> list[Section]:
         """Return the models, the best fit first, and the samples on which they are compared."""
         record, one, unit = self.measurement.record, self.found[0], self.units
-        every = "all" if one.count == record.n_samples else f"{one.count} of"
-        samples = (
-            f"{record.name}: {every} {record.n_samples} samples, from {one.t[0]:.6g} to {one.t[-1]:.6g} {unit.time}"
-        )
-        rows = [row | {test: _verdict(row[test], row[p]) for test, p in TESTS} for row in self._rows()]
+        used = "all" if one.count == record.n_samples else f"{one.count} of"
+        samples = f"{record.name}: all models use {used} {record.n_samples} samples, from {one.t[0]:.6g} to "
+        rows = [row | {test: _outcome(row[test], row[p]) for test, p in TESTS} for row in self._rows()]
         columns = (
             Column("name", "model"),
             Column("fit_percent", "fit %", ".2f"),
             Column("r2", "R2", ".5g"),
             Column("rms", form=".4g", unit=unit.output if unit.is_known(unit.output) else ""),
             Column("white"),
-            Column("whiteness_p_value", "p, white", ".2g"),
             Column("uncorrelated", "independent"),
-            Column("cross_p_value", "p, independent", ".2g"),
             Column("initial_state", "initial state"),
             Column("offset"),
         )
         best_first = sorted(rows, key=lambda row: -row["fit_percent"])
         return [
-            Section(sentences=[f"{samples}, the same for all models."]),
+            Section(sentences=[f"{samples}{one.t[-1]:.6g} {unit.time}."]),
             Section.table(best_first, columns, notes=[MEANING], drawing=self.drawing()),
         ]
 
@@ -144,6 +141,8 @@ class ModelComparison(Result):
         upper.margins(x=0.0)
 
 
-def _verdict(passed: bool | None, p_value: float | None) -> bool | None:
-    """Return whether a test is passed, None if it could not be made."""
-    return None if p_value is None or np.isnan(p_value) else passed
+def _outcome(passed: bool | None, p_value: float | None) -> str | None:
+    """Return whether a test is passed, with its p-value; None if it could not be made."""
+    if p_value is None or np.isnan(p_value):
+        return None
+    return f"{'yes' if passed else 'no'} ({probability(p_value)})"

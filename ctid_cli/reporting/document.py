@@ -215,11 +215,11 @@ def _text_table(lines: list[list[str]], sides: str, columns: int | None = None) 
 def _key_count(rows: Sequence[Sequence[str]], sides: str) -> int:
     """Return the number of first columns that identify all rows; if none do, of those before the first number."""
     # An empty cell repeats the one above it.
-    told = ["" for _ in rows]
+    keys = ["" for _ in rows]
     for k, column in enumerate(zip(*rows, strict=True)):
         filled: Iterator[str] = itertools.accumulate(column, lambda above, own: own or above)
-        told = [f"{before}\n{own}" for before, own in zip(told, filled, strict=True)]
-        if len({*told}) == len(told):
+        keys = [f"{before}\n{own}" for before, own in zip(keys, filled, strict=True)]
+        if len({*keys}) == len(keys):
             return k + 1
     return max(1, sides.find("r", 1))
 

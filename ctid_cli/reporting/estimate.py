@@ -63,8 +63,8 @@ def _delay_status(delay: float | None, bounds: Sequence[float] | None) -> str:
 PARAMETER = (
     Column("name", "parameter"),
     Column("estimate"),
-    Column("standard_error", "standard error", ".3g"),
-    Column("relative_percent", "relative %", ".2g"),
+    Column("standard_error", "std error", ".3g"),
+    Column("relative_percent", "rel. %", ".2g"),
     Column("low", "95 % low", ".5g"),
     Column("high", "95 % high", ".5g"),
     Column("unit"),

@@ -12,7 +12,6 @@ from ctid_cli.errors import MachineError
 from ctid_cli.reporting import surprises as unexpected
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.figures.experiment_plot import experiment_drawing
-from ctid_cli.reporting.figures.style import Picture
 from ctid_cli.reporting.measures import Row, default_measures, measure_frame
 from ctid_cli.reporting.paired_result import compare_estimators
 from ctid_cli.reporting.results import Results
@@ -124,7 +123,7 @@ class ExperimentResults(Results, Result):
         """
         return compare_estimators(self, f"{first},{second}", self.out).to_frame().infer_objects()
 
-    def figure(self, kind: str | None = None, measure: str | None = None, parameters: Sequence[str] = ()) -> Picture:
+    def figure(self, kind: str | None = None, measure: str | None = None, parameters: Sequence[str] = ()) -> Figure:
         """Return a figure of the experiment, as ``ctid figure`` draws.
 
         Parameters
@@ -138,15 +137,15 @@ class ExperimentResults(Results, Result):
 
         Returns
         -------
-        Picture
-            The bytes of an SVG file, which a notebook shows.
+        matplotlib.figure.Figure
+            The figure, which a notebook shows.
 
         Raises
         ------
         UsageError
             If the experiment has no such figure.
         """
-        return experiment_drawing(self, kind, measure, parameters).picture()
+        return experiment_drawing(self, kind, measure, parameters).figure()
 
 
 def read_results(folder: str | os.PathLike[str]) -> ExperimentResults:

@@ -21,7 +21,6 @@ from ctid_cli.inference.intervals import BIASED, UncertainValue
 from ctid_cli.inference.noise_estimate import NoiseEstimate
 from ctid_cli.inference.units import Units
 from ctid_cli.models.additive import AdditiveModel
-from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.document import Column
 from ctid_cli.reporting.estimate import parameter_rows
 from ctid_cli.reporting.layout import picked
@@ -33,11 +32,12 @@ from ctid_cli.signals.record import Record
 DERIVED = (
     Column("name", "derived"),
     Column("estimate"),
-    Column("standard_error", "standard error", ".3g"),
+    Column("standard_error", "std error", ".3g"),
     Column("low", "95 % low"),
     Column("high", "95 % high"),
     Column("unit"),
 )
+FRACTION = ("numerator", "denominator", "delay")
 DERIVED_KEYS = (*(column.key for column in DERIVED), "reason")
 TEST_KEYS = ("white", "whiteness_p_value", "uncorrelated", "cross_p_value", "level", "lags", "sentence")
 
@@ -95,15 +95,11 @@ def _model_object(fitted: Identification) -> dict[str, Any]:
     """Return the model; for several inputs a transfer function for each."""
     fit, additive = fitted.fit, additive_of(fitted.fit)
     if isinstance(fit, MultiInputFit):
-        parts = {name: _fraction_object(part) for name, part in fit.model.parts.items()}
+        parts = {name: picked(part, FRACTION) for name, part in fit.model.parts.items()}
         return {"inputs": parts, "common_denominator": fit.model.common}
     numerator = [item.estimate for item in fitted.estimates if item.name.startswith("b")]
-    found = _fraction_object(fit.model) | ({"numerator": numerator} if numerator else {})
+    found = picked(fit.model, FRACTION) | ({"numerator": numerator} if numerator else {})
     return found if additive is None else {**found, "submodels": [asdict(part) for part in additive.submodels]}
-
-
-def _fraction_object(model: TransferFunction) -> dict[str, Any]:
-    return {"numerator": model.numerator, "denominator": model.denominator, "delay": model.delay}
 
 
 def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:

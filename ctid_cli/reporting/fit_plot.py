@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -51,37 +51,15 @@ class FitFigures:
 
         return Drawing(8.0, 3.4 * n + 2.8, draw)
 
-    def outputs(self) -> Drawing:
-        """Draw measured and simulated output of each experiment."""
-        return self._by_experiment(self.draw_output)
-
-    def residuals(self) -> Drawing:
-        """Draw the residuals of each experiment."""
-        return self._by_experiment(self.draw_residuals)
-
-    def _by_experiment(self, part: Callable[[Any, int], None]) -> Drawing:
-        def draw(figure: Figure) -> None:
-            for k, axes in enumerate(figure.subplots(self.drawn, 1, squeeze=False)[:, 0]):
-                part(axes, k)
-                axes.margins(x=0.0)
-                self._name_panels(axes, axes, k)
-
-        return Drawing(8.0, 2.8 * self.drawn, draw)
-
-    def correlations(self) -> Drawing:
-        """Draw the correlation of the residuals, or innovations, with themselves and with the input."""
-
-        def draw(figure: Figure) -> None:
-            both = figure.subplots(1, 2)
-            self.draw_autocorrelation(both[0])
-            self.draw_cross_correlation(both[1])
-
-        return Drawing(8.0, 3.0, draw)
+    def cross_correlation(self) -> Drawing:
+        """Draw the correlation of the residuals, or innovations, with the delayed input."""
+        return Drawing(5.5, 2.6, lambda figure: self.draw_cross_correlation(figure.add_subplot()))
 
     # --- panels ------------------------------------------------------------------------------------
 
     def draw_experiments(self, figure: Figure, grid: Any) -> None:
         """Draw output and residuals of the first experiments, each in two rows of a grid."""
+        n = len(self.measurements)
         for k in range(self.drawn):
             output = figure.add_subplot(grid[2 * k, :])
             self.draw_output(output, k)
@@ -90,14 +68,15 @@ class FitFigures:
             self.draw_residuals(error, k)
             for axes in (output, error):
                 axes.margins(x=0.0)
-            self._name_panels(output, error, k)
+            if n > 1:
+                output.set_title(f"experiment {k + 1} of {n}", loc="left")
 
     def draw_output(self, axes: Any, k: int) -> None:
         """Draw measured and simulated output of an experiment, and samples with a small weight."""
         record, fit = self.measurements[k].record, self.result.fit
         if fit.weighting is not None and fit.weighting.outliers[k].any():
             little = np.flatnonzero(fit.used[k])[fit.weighting.outliers[k]]
-            axes.plot(record.t[little], record.y[little], "x", color="black", markersize=4, label="counts for little")
+            axes.plot(record.t[little], record.y[little], "x", color="black", markersize=4, label="small weight")
         draw_overlay(axes, self.measurements[k], fit.used[k], fit.residuals[k], self.units)
 
     def draw_residuals(self, axes: Any, k: int) -> None:
@@ -105,16 +84,9 @@ class FitFigures:
         fit, t = self.result.fit, self.measurements[k].record.t
         axes.plot(*curve(t, fit.used[k], fit.residuals[k]), color=DARK, linewidth=0.7)
         axes.axhline(0.0, color="black", linewidth=0.6)
-        name_axes(axes, y=self.units.label("residual", self.units.output))
-
-    def _name_panels(self, upper: Any, lower: Any, k: int) -> None:
-        """Label the time axis of the lower panel, and the upper panel with the experiment."""
-        t, n = self.measurements[k].record.t, len(self.measurements)
         thinned = f"; the least and the greatest of each {t.size // STRIPES} samples are drawn"
-        label = self.units.column(self.measurements[k], "time")
-        name_axes(lower, label + thinned * (outline(t, t)[0].size < t.size))
-        if n > 1:
-            upper.set_title(f"experiment {k + 1} of {n}", loc="left")
+        label = self.units.column(self.measurements[k], "time") + thinned * (outline(t, t)[0].size < t.size)
+        name_axes(axes, label, self.units.label("residual", self.units.output))
 
     def draw_autocorrelation(self, axes: Any) -> None:
         """Draw the autocorrelation of the residuals or innovations of each experiment, with the band of white ones."""

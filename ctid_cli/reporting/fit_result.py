@@ -35,8 +35,6 @@ from ctid_cli.reporting.model_plot import figure_chapters, inputs_drawing
 from ctid_cli.reporting.pages.page import Chapter, PagedResult, shown
 from ctid_cli.reporting.pages.question import formula
 from ctid_cli.reporting.records import Records
-from ctid_cli.signals.band_limited import band_limited_doubt
-from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Loop, Record
 from ctid_cli.signals.treatment import Hold
@@ -66,8 +64,6 @@ TREATMENTS = {
 POSITIVE = re.compile("time_constant|natural_frequency")
 #: Significant digits of the coefficients in the equation.
 DIGITS = 5
-#: Most instants of outliers in the text.
-MOST_NAMED = 5
 #: Effect of a loss on the listed samples, and its name.
 LITTLE = {"huber": "less than half their weight", "tukey": "no weight"}
 LOSSES = {"huber": "Huber's", "tukey": "Tukey's biweight"}
@@ -108,13 +104,15 @@ class FitResult(PagedResult):
 
     def sections(self) -> list[Section]:
         """Return records, settings, parameters, derived quantities, diagnostics and warnings."""
-        lists = {"Chosen:": self.fitted.choices, "Warnings:": self.fitted.warnings}
-        chosen, warnings = (
-            [Section(title, [f"- {text}" for text in texts])] if texts else [] for title, texts in lists.items()
-        )
-        quality = Section(frame=pairs(self.quality()), drawing=self.drawing())
-        settings = Section(frame=pairs(self.settings()))
-        return [*chosen, self.data(), settings, self.parameters(), self.derived(), quality, *warnings]
+        return [
+            _titled_list("Chosen:", self.fitted.choices),
+            self.data(),
+            Section(frame=pairs(self.settings())),
+            self.parameters(),
+            self.derived(),
+            Section(frame=pairs(self.quality()), drawing=self.drawing()),
+            _titled_list("Warnings:", self.fitted.warnings),
+        ]
 
     def to_frame(self) -> pd.DataFrame:
         """Return a row for each parameter: estimate, standard error, interval, unit and status."""
@@ -128,20 +126,20 @@ class FitResult(PagedResult):
     def page_head(self) -> tuple[str, str]:
         """Return the title of the page, and the quality of the simulation."""
         fit, validation = self.fitted.fit, self.fitted.validation
-        structure = "; ".join(f"{name} {spelled(own)}".strip() for name, own in self._structures()) + self.lost_poles
-        lead = f"{structure}: simulates {number(fit.fit_percent, 4)} % of "
-        lead += count(fit.count, "sample")
+        structure = "; ".join(f"{name}: {spelled(own)}" if name else spelled(own) for name, own in self._structures())
+        lead = f"{structure}{self.lost_poles}. Fit {number(fit.fit_percent, 4)} % on {count(fit.count, 'sample')}"
         if validation is not None:
-            seen = self.fitted.seen_in_validation
-            made = f"of which {count(seen, 'sample')} made it" if seen else "which it was not made from"
-            lead += f"; {number(validation.fit_percent, 4)} % on {shown(validation.name) or 'a record'}, {made}"
-        title = "Fit of " + ", ".join(shown(record.name) or "a record" for record in self.records.data)
-        return title, f"{lead}. {fit.status.value}"
+            common = self.fitted.seen_in_validation
+            shared = f" ({count(common, 'sample')} of it also used for the estimation)" if common else ""
+            lead += (
+                f"; {number(validation.fit_percent, 4)} % on the validation record {_shown(validation.name)}{shared}"
+            )
+        return f"Fit of {', '.join(_shown(record.name) for record in self.records.data)}", f"{lead}. {fit.status.value}"
 
     def chapters(self) -> Iterator[Chapter]:
         """Return data, model and figures."""
         yield from self.chapters_of_numbers()
-        yield from figure_chapters(self.figures, self.records.validation)
+        yield from figure_chapters(self.figures, self.drawing(), self.records.validation)
 
     def chapters_of_numbers(self) -> Iterator[Chapter]:
         """Return data and model."""
@@ -151,7 +149,7 @@ class FitResult(PagedResult):
             terms = [(part.numerator.tolist(), part.denominator.tolist(), poles) for part, poles in parts]
             equation = formula(terms, delayed=model.delay > 0, digits=DIGITS)
             equations.append(f"Response to {name}: {equation}" if name else equation)
-        quality = Section("How good it is", frame=pairs(self.quality()))
+        quality = Section("Quality of the fit", frame=pairs(self.quality()))
         yield Chapter("Data", [self.data(), Section(frame=pairs(self.settings()))])
         yield Chapter("Model", [Section(sentences=equations), self.parameters(), self.derived(), quality])
 
@@ -183,8 +181,9 @@ class FitResult(PagedResult):
         notes = list(dict.fromkeys(row.reason for row in rows if row.reason))
         below = [row.name for row in rows if POSITIVE.search(row.name) and row.low < 0.0]
         if below:
-            what = f"Intervals of {listed(below)} reach" if len(below) > 1 else f"The interval of {below[0]} reaches"
-            notes.append(f"{what} below 0, where no value can be: the error is too large for a linearised interval.")
+            notes.append(
+                f"The linearised intervals of {listed(below)} contain negative values: the errors are too large."
+            )
         return Section.table(rows, DERIVED, notes=notes)
 
     def settings(self) -> Iterator[tuple[str, str]]:
@@ -194,18 +193,13 @@ class FitResult(PagedResult):
         yield from _loop(options, first)
         if isinstance(fit, SubmodelsFit):
             yield "start", fit.start_method
-        yield (
-            "initial state",
-            f"{TREATMENTS[options.initial_state]}{_before(self.fitted, options.initial_state)}",
-        )
+        yield "initial state", f"{TREATMENTS[options.initial_state]}{_before(self.fitted)}"
         yield "offset", f"{_offset(self.fitted, units)} (--offset {options.offset})"
         record = first.record
         for text, signal in zip(record.hold_options, record.held.values(), strict=False):
             of, _, _ = text.rpartition("=")
-            yield (
-                f"input {of}" if of else "inputs" if record.several else "input",
-                f"{HOLDS[signal.hold]} (--hold {text}){_unknown_ends(signal, options, units)}",
-            )
+            label = f"input {of}" if of else "inputs" if record.several else "input"
+            yield label, f"{HOLDS[signal.hold]} (--hold {text})"
         if fit.weighting is not None:
             yield "loss", _loss_text(fit, fit.weighting, self.records.data, units)
 
@@ -229,8 +223,8 @@ class FitResult(PagedResult):
         if isinstance(self.fitted.fit, MultiInputFit) and isinstance(options, DelayProfile):
             yield "model", "common denominator" if options.common else "a denominator for each input"
         for name, own in self._structures():
-            asked = f"{spelled(own)}{self.lost_poles}"
-            yield f"input {name}" if name else "model", f"{asked}; delay {_searched(own, self.units)}"
+            structure = f"{spelled(own)}{self.lost_poles}"
+            yield f"input {name}" if name else "model", f"{structure}; delay {_searched(own, self.units)}"
         if options.fixed:
             yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
 
@@ -243,22 +237,19 @@ class FitResult(PagedResult):
         if fit.noise is not None:
             yield from self._noise(fit.noise)
         if validation is not None:
-            text = f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on "
-            text += f"{shown(validation.name) or 'a record'}, {count(validation.count, 'sample')}"
-            yield "validation", f"{text}; initial state and offset of its own"
+            text = (
+                f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on {_shown(validation.name)}"
+            )
+            yield "validation", f"{text}, {count(validation.count, 'sample')}; with its own initial state and offset"
             for k in self.predicted:
                 assert fit.noise is not None
-                yield f"  {k} ahead", f"fit {number(validation.prediction_fit(fit.noise, k), 5)} % of predictions"
+                yield "", _prediction(k, validation.prediction_fit(fit.noise, k))
         what = "mean squared output error" if fit.weighting is None else "twice the mean loss"
         yield "cost", f"{units.amount(number(fit.cost), units.square)}, {what}"
         per = "cost" if fit.noise is None else "var e"
-        sizes = f"N = {criteria.count} samples and p = {criteria.parameters} parameters"
-        yield "AIC", f"{number(criteria.aic)} = N ln {per} + 2 p with {sizes}"
-        yield "AICc", f"{number(criteria.aicc)} = AIC + 2 (p + 1)(p + 2) / (N - p - 2)"
+        yield "AIC", f"{number(criteria.aic)} = N ln {per} + 2 p"
         yield "BIC", f"{number(criteria.bic)} = N ln {per} + p ln N"
-        yield "FPE", f"{units.amount(number(criteria.fpe), units.square)} = {per} (N + p) / (N - p)"
-        yield "YIC, R_T^2", f"{number(self.fitted.yic, 5)}, {number(self.fitted.r_t_squared, 6)}"
-        yield "condition number", number(fit.condition_number, 3)
+        yield "", f"N = {criteria.count} samples, p = {criteria.parameters} parameters"
         if isinstance(fit, SubmodelsFit):
             yield from fit.conditions
         yield from self.search()
@@ -273,7 +264,8 @@ class FitResult(PagedResult):
         if fit.status is not Status.CONVERGED:
             yield "status", fit.status.value
         if fit.starts is not None:
-            yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
+            tried, agree = fit.starts
+            yield "search", f"best of {count(tried, 'start')}" + f", reached from {agree} of them" * (tried > 1)
         for name, end in fit.bounds_met:
             yield "at bound", f"{name} = {end:g}, as given"
         at_box = fit.held_poles or (fit.status in (Status.AT_BOUND, Status.RIDGE) and not fit.bounds_met)
@@ -295,13 +287,10 @@ class FitResult(PagedResult):
         variance = units.amount(number(estimate.noise.innovation_variance or 0.0), units.square)
         yield "noise", f"ARMA({p},{q}){chosen}: {estimate.formula}; variance of e {variance}"
         for k in self.predicted:
-            text = f"{number(fit.prediction_fit(k), 5)} % of predictions from outputs at least {count(k, 'sample')} old"
-            yield f"fit {k} ahead", text
-        ratios = zip(fit.parameter_names, estimate.error_ratios(fit.covariance).tolist(), strict=True)
-        each = ", ".join(f"{name} {number(ratio, 3)}" for name, ratio in ratios if np.isfinite(ratio))
-        text = f"fit {number(estimate.output_error_fit, 5)} %; its standard errors over those here: {each}"
-        test = f"Hausman's test of the difference: {probability(estimate.test.p_value)}"
-        yield "output error", f"{text}. {test if estimate.test.freedom else 'Nothing is gained that a test could use'}"
+            yield "", _prediction(k, fit.prediction_fit(k))
+        yield "output error", f"fit {number(estimate.output_error_fit, 5)} % without the noise model"
+        if estimate.test.freedom:
+            yield "", f"its difference from this fit: {probability(estimate.test.p_value)} by Hausman's test"
 
     def file_text(self, folder: Path, command: str | None = None) -> str:
         """Return the text of ``fit.json`` in a folder; paths of records are relative to it."""
@@ -313,15 +302,18 @@ class FitResult(PagedResult):
         return fit_content(self.fitted, self.records, self.predicted)
 
 
-def _unknown_ends(signal: HeldSignal, options: Options, units: Units) -> str:
-    """Return how well a band-limited input is known without the samples beyond its ends."""
-    if signal.hold != "band-limited" or options.initial_state == "periodic":
-        return ""
-    doubt = band_limited_doubt(signal.t, signal.values)
-    level = units.amount(f"{doubt.ends:.2g}", units.input)
-    known = f"within {doubt.reach:.3g} {units.time} of the ends known to about {level}"
-    rough = f"; {100 * doubt.beyond:.2g} % of its power is too close to the Nyquist frequency" * (doubt.beyond > 0.01)
-    return f", {known}{rough}"
+def _titled_list(title: str, texts: Sequence[str]) -> Section:
+    """Return a list under a title, or nothing if it is empty."""
+    return Section(title, [f"- {text}" for text in texts]) if texts else Section()
+
+
+def _shown(name: str) -> str:
+    """Return the name of a record without its folder."""
+    return shown(name) or "a record"
+
+
+def _prediction(k: int, fit_percent: float) -> str:
+    return f"fit {number(fit_percent, 5)} % of predictions {count(k, 'sample')} ahead"
 
 
 def _searched(options: Options, units: Units) -> str:
@@ -334,7 +326,7 @@ def _loop(options: Options, measurement: Measurement) -> Iterator[tuple[str, str
     """Yield the loop of a record, and which part of it the estimator uses."""
     loop, instruments = measurement.record.loop, getattr(options, "instruments", "open_loop")
     if instruments == "reference":
-        yield "loop", f"controller not known; what of the input follows r = {measurement.reference} as instrument"
+        yield "loop", f"unknown controller; instruments from the reference r = {measurement.reference}"
     elif instruments == "closed_loop" and loop is not None and loop.controller is not None:
         simulated = isinstance(options, LoopOutputError)
         how = "output error of the simulated loop, y - T r" if simulated else "instruments from the noise-free loop"
@@ -363,9 +355,9 @@ def _record_line(measurement: Measurement, used: int, units: Units) -> str:
     return f"{shown(record.name) or 'record'}: {count(record.n_samples, 'sample')}{span}; {columns}"
 
 
-def _before(result: Identification, state: str) -> str:
+def _before(result: Identification) -> str:
     """Return the input before the record, if it is not zero, and its options and those of the state."""
-    before, state = getattr(result.options, "input_before", None), f"--initial-state {state}"
+    before, state = getattr(result.options, "input_before", None), f"--initial-state {result.options.initial_state}"
     if before is None:
         return f" ({state})"
     levels = ", ".join(f"{level:.6g}" for level in result.fit.input_offsets)
@@ -402,15 +394,9 @@ def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record]
     text = f"{LOSSES[kind]} (--loss {kind}), standard deviation {deviation} from the median absolute error"
     total = sum(each.size for each in times)
     samples = f"{total} of {count(fit.count, 'sample')} {'has' if total == 1 else 'have'} {LITTLE[kind]}"
-    if not total:
-        return f"{text}; {samples}"
-    listed = []
-    for k, each in enumerate(times, start=1):
-        where = f" of experiment {k}" if len(records) > 1 else ""
-        some = ", ".join(f"{t:.6g}" for t in each[:MOST_NAMED]) + (", ..." if each.size > MOST_NAMED else "")
-        listed += [f"{some} {units.time}{where}"] * (each.size > 0)
-    without = number(weighting.fit_percent(records, fit.used, fit.residuals), 5)
-    return f"{text}; {samples}, at {'; '.join(listed)}; fit {without} % without them"
+    if total:
+        samples += f"; fit {number(weighting.fit_percent(records, fit.used, fit.residuals), 5)} % without them"
+    return f"{text}; {samples}"
 
 
 def _tested(test: ResidualTests) -> str:

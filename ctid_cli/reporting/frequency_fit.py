@@ -75,12 +75,12 @@ class FrequencyFitResult(FitResult):
         """Yield the estimator, and the treatment of the data."""
         data, time = self.fit.data, self.units.time
         yield from self.structure()
-        sampled = f"those of samples at intervals of {data.interval:g} {time}, input constant between them"
-        yield "values", sampled if data.interval else "G(jw)"
+        sampled = f"of samples at intervals of {data.interval:g} {time}, input constant between them"
+        yield "response", sampled if data.interval else "in continuous time, G(jw)"
         if data.standard_error is None:
             yield "weights", f"{WEIGHTS[data.weight]} (--weight {data.weight})"
         else:
-            yield "weights", "reciprocal of standard_error"
+            yield "weights", "reciprocal of the standard errors"
 
     def parameters(self) -> Section:
         """Return the parameters with their uncertainty."""
@@ -91,16 +91,16 @@ class FrequencyFitResult(FitResult):
         """Return the assumptions of the standard errors."""
         fit, law = self.fit, self.fitted.uncertainty
         if not self.fitted.answer.seen:
-            return "There are no standard errors, as the values are not seen to be anything but noise."
+            return "There are no standard errors, as the response is not distinguishable from noise."
         if not np.isfinite(np.diag(law.covariance)).any():
             return "There are no standard errors."
         if law.kind == "robust":
             why = "the lines share samples" if fit.data.correlated else "the residuals of neighbouring lines are"
-            text = f"Standard errors are rough, those for correlated errors of neighbouring lines, as {why}"
+            text = f"Standard errors are approximate, for correlated errors of neighbouring lines, as {why}"
         elif fit.errors_known:
-            text = "Standard errors are from those of the data, which the residuals agree with"
+            text = "Standard errors are based on those of the data, with which the residuals agree"
         else:
-            text = "Standard errors are from the residuals of the lines, taken as independent"
+            text = "Standard errors are based on the residuals of the lines, assumed independent"
         return f"{text}; intervals are estimate -+ {law.quantile(np.zeros(1)):.3g} of them."
 
     def quality(self) -> Iterator[tuple[str, str]]:
@@ -112,14 +112,9 @@ class FrequencyFitResult(FitResult):
         if fit.data.standard_error is not None:
             size = f"{number(np.sqrt(fit.excess), 4)} times the standard errors of the data"
             yield "residuals", f"{size} ({probability(fit.misfit_p_value)})"
-        sizes = f"N = {criteria.count} real equations and p = {criteria.parameters} parameters"
-        yield "AICc, BIC", f"{number(criteria.aicc)}, {number(criteria.bic)} with {sizes}"
-        yield "condition number", number(fit.condition_number, 3)
+        sizes = f"N = {criteria.count} real equations, p = {criteria.parameters} parameters"
+        yield "AICc, BIC", f"{number(criteria.aicc)}, {number(criteria.bic)}; {sizes}"
         yield from self.search()
-        yield (
-            "lines",
-            "errors of neighbours pass as uncorrelated" if fit.white else "errors of neighbours are correlated",
-        )
 
     def drawing(self) -> Drawing:
         """Return the figure of gain, phase and residuals."""
@@ -129,8 +124,8 @@ class FrequencyFitResult(FitResult):
         """Return the title of the page, and the quality of the fit."""
         fit = self.fit
         lines = count(fit.data.frequencies.size, "weighted line")
-        asked = f"{spelled(self.fitted.options)}{self.lost_poles}"
-        lead = f"{asked}: {number(fit.fit_percent, 4)} % of {lines}. {fit.status.value}"
+        structure = f"{spelled(self.fitted.options)}{self.lost_poles}"
+        lead = f"{structure}. Fit {number(fit.fit_percent, 4)} % on {lines}. {fit.status.value}"
         return f"Fit of {shown(fit.data.name) or 'a frequency response'}", lead
 
     def chapters(self) -> Iterator[Chapter]:

@@ -64,10 +64,10 @@ def draw_points(
     floor = np.maximum(low, 0.1 * np.minimum(size, found.standard_error))
     gain.set_xscale("log")
     phase.set_xscale("log")
-    seen = size > 0
-    w, drawn = found.frequencies, seen & found.has_interval
+    nonzero = size > 0
+    w, drawn = found.frequencies, nonzero & found.has_interval
     gain.vlines(w[drawn], decibels(floor[drawn]), decibels(high[drawn]), color=BAND, linewidth=1.6, zorder=0)
-    gain.plot(w[seen], decibels(size[seen]), ".", color=MIDDLE, markersize=3, label=label, zorder=1)
+    gain.plot(w[nonzero], decibels(size[nonzero]), ".", color=MIDDLE, markersize=3, label=label, zorder=1)
     known = found.phase_known()
     angle, half = np.rad2deg(found.phase()[known]), np.rad2deg(found.phase_band()[known])
     if around is not None:

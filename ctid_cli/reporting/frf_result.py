@@ -80,12 +80,12 @@ class FrequencyResponseResult(Result):
         """Return all frequencies, with 95 % intervals."""
         names, found = {column.key: column.name for column in quantities(self.records.units)}, self.found
         # Attributes that a fit to the table uses.
-        told = {
+        attributes = {
             "freedom": found.freedom,
             "hold_interval": np.full(found.frequencies.size, found.interval or np.nan),
             "correlated": np.full(found.frequencies.size, found.method != "periodic"),
         }
-        return pd.DataFrame({names[key]: values for key, values in (self._values() | told).items()})
+        return pd.DataFrame({names[key]: values for key, values in (self._values() | attributes).items()})
 
     def content(self) -> dict[str, Any]:
         """Return the response for JSON."""

@@ -6,8 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-from ctid_cli.text import count as count  # re-exported for figures
-
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], sides: str) -> str:
     """Return a table in Markdown, each column to the left (``l``) or to the right (``r``)."""

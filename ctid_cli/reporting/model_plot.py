@@ -104,7 +104,7 @@ def inputs_drawing(figures: FitFigures) -> Drawing:
             step, gain = figure.add_subplot(grid[row : row + 2, 0]), figure.add_subplot(grid[row, 1])
             draw_step(step, model.step_response(), units)
             draw_bode(gain, figure.add_subplot(grid[row + 1, 1], sharex=gain), model.frequency_response(), units)
-            for axes, what in ((step, "step of"), (gain, "response to")):
+            for axes, what in ((step, "unit step response to"), (gain, "frequency response to")):
                 axes.set_title(plain(f"{what} {name}"), loc="left")
 
     return Drawing(8.0, 3.4 * n + 2.8 + 3.2 * len(models), draw)
@@ -149,48 +149,44 @@ def draw_poles(axes: Any, band: PoleBand) -> None:
     axes.plot(band.value.real, band.value.imag, "x", color=DARK, markersize=5, markeredgewidth=1.2, label="pole")
 
 
-def delay_drawing(figures: FitFigures, near: DelayCosts | None) -> Drawing:
-    """Return the search over the delay, and the cost close to the estimate, which shows its minimum."""
-    delay, time = figures.delay, figures.units.time
+def delay_drawing(near: DelayCosts, delay: float, units: Units) -> Drawing:
+    """Return the cost over delays close to the estimate, with all other parameters free."""
 
     def draw(figure: Figure) -> None:
-        panels = figure.subplots(1, 1 if near is None else 2, squeeze=False)[0]
-        figures.draw_profile(panels[0])
-        if near is None:
-            return
-        axes, allowed = panels[1], near.percent_above(near.allowed)
+        axes, allowed = figure.add_subplot(), near.percent_above(near.allowed)
         share = near.percent_above(near.costs)
         axes.plot(near.delays, share, ".-", color=DARK, linewidth=0.8, markersize=4, label="all other parameters free")
-        axes.plot([delay], [0.0], "v", color="black", markersize=7, label=f"estimate {delay:.5g} {plain(time)}")
+        axes.plot([delay], [0.0], "v", color="black", markersize=7, label=f"estimate {delay:.5g} {plain(units.time)}")
         axes.axhline(allowed, color=MARK, linewidth=0.9, linestyle="--", label="95 % interval: below this")
         axes.set_ylim(top=1.35 * max(float(np.max(share)), allowed))
-        name_axes(axes, f"delay [{time}]", "cost above the least [%]", legend="upper center")
+        name_axes(axes, f"delay [{units.time}]", "cost above the least [%]", legend="upper center")
 
-    return Drawing(5.5 if near is None else 8.0, 3.2, draw)
+    return Drawing(5.5, 3.2, draw)
 
 
-def figure_chapters(figures: FitFigures, validation: Measurement | None) -> Iterator[Chapter]:
-    """Return the figures of a page: outputs, residuals, responses, poles, and the search over the delay."""
+def figure_chapters(figures: FitFigures, main: Drawing, validation: Measurement | None) -> Iterator[Chapter]:
+    """Return the figures of a page: the main one, responses, poles, and the cost about the delay."""
     result, units = figures.result, figures.units
-    output = [Section(drawing=figures.outputs(), caption="Measured and simulated.")]
     outcome, more = result.validation, len(figures.measurements) - MOST_DRAWN
+    several, left = len(models_of(result)) > 1, result.fit.left_over
+    what = "responses to each input" if several else "the search over the delay"
+    found = [Section(drawing=main, caption=f"Output, residuals, autocorrelation of the {left}, and {what}.")]
+    found += [Section(sentences=[f"{more} more experiments are not drawn."])] if more > 0 else []
+    if result.tests and not several:
+        caption = f"Correlation of the {left} with the {result.driver}."
+        found.append(Section(drawing=figures.cross_correlation(), caption=caption))
+    found.append(Section(notes=[test.sentence for test in result.tests]))
     if outcome is not None and validation is not None:
-        caption = f"The same on {shown(outcome.name)}, from which only the initial state and the offset were estimated."
-        output.append(Section(drawing=validation_drawing(outcome, validation, units), caption=caption))
-    output += [Section(sentences=[f"{more} more experiments are not drawn."])] if more > 0 else []
-    yield Chapter("Output", output)
-    what = result.fit.left_over
-    caption = f"Correlation of the {what} with themselves and with the {result.driver}."
-    correlations = [Section(drawing=figures.correlations(), caption=caption)] if result.tests else []
-    notes = Section(notes=[test.sentence for test in result.tests])
-    yield Chapter("Residuals", [Section(drawing=figures.residuals(), caption="Residuals."), *correlations, notes])
-    models = models_of(result)
-    yield Chapter("Responses", _responses(figures) if len(models) == 1 else _responses_to_inputs(figures))
+        caption = f"Validation record {shown(outcome.name)}; only its initial state and offset are estimated from it."
+        found.append(Section(drawing=validation_drawing(outcome, validation, units), caption=caption))
+    yield Chapter("Output", found)
+    if not several:
+        yield Chapter("Responses", _responses(figures))
     yield poles_chapter(result, units)
-    if result.fit.profile is not None:
-        near = costs_about_delay(result)
-        caption = "The search over the whole range" + (", and the cost about the estimate." if near else ".")
-        yield Chapter("Delay", [Section(drawing=delay_drawing(figures, near), caption=caption)])
+    near = None if result.fit.profile is None else costs_about_delay(result)
+    if near is not None:
+        drawing = delay_drawing(near, figures.delay, units)
+        yield Chapter("Delay", [Section(drawing=drawing, caption="Cost about the estimated delay.")])
 
 
 def poles_chapter(result: Identification, units: Units) -> Chapter:
@@ -220,14 +216,3 @@ def _responses(figures: FitFigures) -> list[Section]:
         Section(notes=notes),
         Section(drawing=step, caption="Response to a unit step, with its pointwise band."),
     ]
-
-
-def _responses_to_inputs(figures: FitFigures) -> list[Section]:
-    """Return the transfer function of each of several inputs over frequency and time."""
-    sections = []
-    for k, (name, model) in enumerate(models_of(figures.result).items()):
-        own = figures.units.of_input(k)
-        bode, step = bode_drawing(model.frequency_response(), None, own), step_drawing(model.step_response(), own)
-        sections.append(Section(drawing=bode, caption=f"Frequency response to {name}, with pointwise 95 % bands."))
-        sections.append(Section(drawing=step, caption=f"Response to a unit step of {name}, with its pointwise band."))
-    return sections

@@ -30,8 +30,8 @@ ROWS = 12
 NO_CANDIDATE = "no"
 ABOUT_NO_CANDIDATE = (
     "- Not to be chosen (no): the data do not determine the parameters; or a pair is held at the least damping or the "
-    "greatest frequency that is admitted, where it follows this record's noise; or a smaller structure predicts blocks "
-    "of the record that it did not see far better."
+    "greatest frequency that is admitted, where it follows this record's noise; or a smaller structure predicts "
+    "held-back blocks of the record far better."
 )
 STRUCTURE = ("poles", "zeros", "integrators")
 #: Columns that identify a sum of second-order submodels.

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from ctid_cli.cli import _compiling
 from ctid_cli.running import engine, job
 from ctid_cli.running.workers import Ending
+from tests.cli.json_schemas import validate_json
 from tests.cli.records import SPECIFICATIONS, first_order, rows, tones, write
 
 
@@ -46,13 +47,19 @@ def without_workers():
 
 @pytest.fixture(scope="session")
 def ctid():
-    """Return a function to run a command: ``ctid("table 1 --out", folder, code=2)``; first words as in a shell."""
+    """Return a function to run a command: ``ctid("table 1 --out", folder, code=2)``; first words as in a shell.
+
+    JSON that is printed is validated against its schema.
+    """
     from ctid_cli.cli.main import app
 
     def call(command, *arguments, code=0):
-        done = CliRunner().invoke(app, [*shlex.split(command), *map(str, arguments)])
+        words = [*shlex.split(command), *map(str, arguments)]
+        done = CliRunner().invoke(app, words)
         assert done.exit_code == code, f"exit code {done.exit_code}\n{done.stdout}\n{done.stderr}\n{done.exception!r}"
         assert "Traceback" not in done.output
+        if done.stdout and ("--json" in words or "--format json" in " ".join(words)):
+            validate_json(words[0], done.stdout)
         return done
 
     return call

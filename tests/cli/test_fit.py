@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from scipy.signal import lfilter
 
 from ctid_cli import Record, load_fit
 from ctid_cli.cli import _progress
-from ctid_cli.cli.fit_structure import StructureOptions
-from ctid_cli.errors import UsageError
+from ctid_cli.cli.fit_structure import delay_range
 from tests.cli.records import rows, write
 
 
@@ -104,8 +104,8 @@ def test_microseconds(ctid, record, tmp_path):
 
 @pytest.mark.parametrize("text", ["3:0", "-1:2", "nan", "0:inf", "0:1:2"])
 def test_a_range_of_delays_is_low_high_and_not_negative(text):
-    with pytest.raises(UsageError, match="--delay must be LOW:HIGH"):
-        _ = StructureOptions(delays=[text]).bounds
+    with pytest.raises(typer.BadParameter, match="must be LOW:HIGH"):
+        delay_range(text)
 
 
 def test_a_fit_is_announced_on_a_terminal(monkeypatch):

@@ -1,4 +1,4 @@
-"""Output of commands in a pipe: text, to be read when it changes, and JSON with its keys and types."""
+"""Output of commands in a pipe: text, to be read when it changes, and JSON, validated against its schema."""
 
 import csv
 import io
@@ -33,27 +33,10 @@ def test_one_estimate_in_full(ctid, home, snapshot, name):
         assert (whole["seed"], whole["settings"]["kind"]) == (1, each["kind"])
 
 
-def structure(*found):
-    """Return the keys and types of the values at one place of plain data."""
-    items = [item for each in found if isinstance(each, list) for item in each]
-    parts = [each for each in found if isinstance(each, dict)]
-    if parts:
-        names = dict.fromkeys(name for each in parts for name in each)
-        return {name: structure(*(each[name] for each in parts if name in each)) for name in names}
-    return [structure(*items)] if items else " or ".join(sorted({type(each).__name__ for each in found}))
-
-
 @pytest.mark.parametrize("command", COMMANDS["json"], ids=str)
-def test_json(ctid, home, snapshot, command):
-    shown = ctid(f"{command} --json").stdout
-    assert ctid(f"{command} --format json").stdout == shown
-    try:
-        found = json.loads(shown)
-    except ValueError:
-        found = [json.loads(line) for line in shown.splitlines()]
-    if "result" in found:
-        del found["result"]  # the fit as in Python
-    assert structure(found) == snapshot
+def test_json_follows_its_schema(ctid, home, command):
+    # The schema is compared in ``ctid``.
+    assert ctid(f"{command} --json").stdout == ctid(f"{command} --format json").stdout
 
 
 @pytest.mark.parametrize("name", ["tiny", "loop", "beat"])

@@ -62,7 +62,7 @@ def test_results_are_those_of_the_commands(out, ctid, tmp_path):
     np.testing.assert_allclose(results.compare("one", "other")["value"], compared["value"])
     assert results.surprises == []
     ctid("figure group/study --kind box --out", out, "--file", tmp_path / "box.svg")
-    assert (tmp_path / "box.svg").read_bytes() == results.figure("box")
+    assert len(results.figure("box").axes) == 2
     with pytest.raises(CtidError, match=r"there is no kind of figure 'boxes'; did you mean 'box'\? there are meas"):
         results.figure("boxes")
     assert results.summary().strip() == ctid("table group/study --out", out).stdout.strip()

@@ -51,10 +51,10 @@ def test_a_page_says_all_and_needs_nothing_but_itself(fitted, tmp_path):
     text, again = page_of(*fitted, tmp_path)
     assert text == again  # the page of the stored fit is identical
     page = alone(text)
-    titles = ["Before using it", "Data", "Model", "Output", "Residuals", "Responses", "Poles", "Delay", "Provenance"]
+    titles = ["Warnings", "Data", "Model", "Output", "Responses", "Poles", "Delay", "Provenance"]
     fine = "The search ended well, the residuals pass their tests, and no change that was tried gives a better fit."
     assert all(title in page.text for title in [*titles, "How to cite", fine])
-    assert page.tags["svg"] == 8
+    assert page.tags["svg"] == 7
     assert not fitted[0].warnings
     for words in ("natural_frequency_1", "95 % low", "without a model", "cost above the least", "@software{ctid"):
         assert words in page.text or words in text

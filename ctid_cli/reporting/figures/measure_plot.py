@@ -14,9 +14,10 @@ import numpy as np
 
 from ctid_cli.reporting.figures.settings import Scale, Settings, placed, scale_of, value_text
 from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, legend_of, look, panels_of, plain, size_for
-from ctid_cli.reporting.layout import count, number
+from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.measures import measure_frame, measure_of
 from ctid_cli.reporting.results import Results
+from ctid_cli.text import count
 
 if TYPE_CHECKING:
     import pandas as pd

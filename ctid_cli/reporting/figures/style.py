@@ -70,16 +70,6 @@ def _import_matplotlib() -> None:
         import matplotlib.figure  # noqa: F401
 
 
-class Picture(bytes):
-    """An SVG file, which a notebook shows."""
-
-    def __repr__(self) -> str:
-        return f"Picture: an SVG file of {len(self)} bytes"
-
-    def _repr_svg_(self) -> str:
-        return self.decode()
-
-
 class Drawing(NamedTuple):
     """A figure to draw."""
 
@@ -93,10 +83,6 @@ class Drawing(NamedTuple):
             figure = _notebook_figure()(figsize=(self.width, self.height), layout="constrained")
             self.draw(figure)
         return figure
-
-    def picture(self) -> Picture:
-        """Draw the figure for a notebook."""
-        return Picture(self.saved())
 
     def saved(self, style: Format = "svg") -> bytes:
         """Draw the figure as a file; the same drawing always gives the same bytes."""

@@ -39,7 +39,7 @@ def experiment_page(results: Results, out: Path) -> str:
     numbers = f"All numbers: `ctid table {results.experiment}{out_option(out)} --format csv`; every estimate: "
     numbers += f"`ctid export {results.experiment}{out_option(out)}`."
     chapters = [
-        Chapter("Before using it", [Section(sentences=[f"- {note}"]) for note in surprises(results)]),
+        Chapter("Warnings", [Section(sentences=[f"- {note}"]) for note in surprises(results)]),
         Chapter("Question", [*_question(results)]),
         Chapter("Tables", [*_tables(results), Section(notes=[numbers])]),
         Chapter("Figures", list(_figures(results, out))),

@@ -122,9 +122,9 @@ class PagedResult(Result):
     def page(self, stored: Mapping[str, Any]) -> str:
         """Return the page as HTML, with the origin stored in the file of the result."""
         warnings = [f"- {text}" for text in stored["warnings"]] or [self.fine]
-        words = ["ctid, and what this result used of others:", bibtex("ctid", *self.cited())]
+        words = ["ctid, and the articles on the methods of this result:", bibtex("ctid", *self.cited())]
         chapters = [
-            Chapter("Before using it", [Section(sentences=warnings)]),
+            Chapter("Warnings", [Section(sentences=warnings)]),
             *self.chapters(),
             Chapter("Provenance", _provenance(stored)),
             Chapter("How to cite", [Section(sentences=words)]),
@@ -154,7 +154,7 @@ def _provenance(stored: Mapping[str, Any]) -> list[Section]:
         rows += [(label, ", ".join([shown(each["path"]), *how])), ("its SHA-256", each["sha256"])]
     rows.append(("checksum of the file", str(stored.get("checksum", ""))))
     command = shown_command(stored["command"]) + "\n"
-    again = ["The same again, in the folder that it was given in:", command] if stored["command"] else []
+    again = ["Command, to be run in the same folder:", command] if stored["command"] else []
     return [Section(frame=pairs(rows)), Section(sentences=again)]
 
 
