@@ -80,15 +80,6 @@ def test_initial_state_and_offset_of_a_noise_free_record_are_found(irregular):
     assert abs(wrong.model.dc_gain / SYSTEM.dc_gain - 1) > 0.01
 
 
-def test_removed_means_are_reported():
-    record = record_of(offset=5.0, noise=0.01, n=2000)
-    y, u = record.y, record.input.values
-    fit = DelayProfile(2, 0, (0, 3), offset="remove", initial_state="estimate").fit(record)
-    assert fit.offsets == pytest.approx([y.mean()])
-    assert fit.input_offsets == pytest.approx([u.mean()])
-    assert_same_model(fit.model, SYSTEM, 0.02)
-
-
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
 def test_a_periodic_record_is_fitted_exactly(hold):
     t = 0.1 * np.arange(2000)
@@ -152,32 +143,6 @@ def test_finds_the_delay_in_heavy_noise(model, regular, replicate):
     assert abs(fit.model.delay - 8.0) < 0.08
     # At most the cost of the true system.
     assert fit.cost <= np.mean((record.y - record.noise_free) ** 2)
-
-
-@pytest.mark.parametrize("treated", [{}, {"offset": "estimate"}])
-def test_the_profile_is_lowest_next_to_the_estimate(treated):
-    # With a filter, or on every sample if an offset is estimated.
-    fit = DelayProfile(2, 0, (0, 15), **treated).fit(make_record(snr_db=15))
-    profile = fit.profile
-    assert (profile.cutoff is None) == bool(treated)
-    spacing = np.diff(profile.delays).max()
-    assert spacing <= 0.5 * np.pi / (profile.cutoff or profile.bandwidth) * (1 + 1e-12)
-    assert abs(profile.delays[np.argmin(profile.costs)] - fit.model.delay) <= 1.5 * spacing
-
-
-def test_records_too_short_for_filters_are_searched_on_every_sample():
-    record = record_of(noise=0.02, n=23)
-    fit = DelayProfile(2, 0, (0, 1)).fit(record)
-    assert fit.profile.cutoff is None
-    assert abs(fit.model.delay - SYSTEM.delay) < 0.1
-
-
-def test_a_delay_outside_the_range_stops_at_the_bound():
-    fit = DelayProfile(2, 0, (0, 0.5)).fit(record_of(noise=0.02))
-    assert fit.status is Status.DELAY_AT_BOUND
-    assert fit.model.delay == 0.5
-    assert np.isnan(fit.standard_errors["delay"])
-    assert np.isfinite(fit.standard_errors["a1"])
 
 
 # --- a given model on other records ----------------------------------------------------------------

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from ctid_cli.errors import DataError
 from ctid_cli.estimation.optimum.box import LIMITS
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import costs_about_delay
@@ -171,17 +170,6 @@ def test_where_no_answer_is_seen_the_first_warning_says_so():
     assert identify([record], OPTIONS).answer.p_value == 0.005
 
 
-def test_too_few_residuals_are_not_tested():
-    result = identify([record_of(n=16, every=2)], DelayProfile(1, 0, (0.55, 0.55)))
-    assert result.tests == ()
-
-
-def test_a_bad_validation_record_is_refused():
-    flat = Record.from_arrays(0.1 * np.arange(50), np.ones(50), np.arange(50.0))
-    with pytest.raises(DataError, match=r"validation record: .*constant"):
-        identify([record_of()], OPTIONS, flat)
-
-
 def test_a_pole_at_the_border_is_held_and_the_others_have_standard_errors():
     """They are those of the model with the free pole and the numerator, from central differences."""
     record = record_of(TransferFunction([1.0], [1.0, 2.0]), n=400, seed=3)
@@ -226,12 +214,6 @@ def test_one_submodel_of_a_band_limited_input_is_the_fraction():
     assert additive.fit.used[0].size == t.size
     np.testing.assert_allclose(additive.fit.model.denominator, fraction.fit.model.denominator, rtol=1e-3)
     np.testing.assert_allclose(additive.fit.cost, fraction.fit.cost, rtol=1e-4)
-
-
-def test_two_experiments_are_tested_one_by_one():
-    result = identify([record_of(), record_of(seed=1, colour=0.9)], OPTIONS)
-    assert [test.white for test in result.tests] == [True, False]
-    assert result.tests[0].level == pytest.approx(0.975)
 
 
 def test_the_cost_about_the_delay_is_least_at_the_estimate():

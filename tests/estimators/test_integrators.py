@@ -56,12 +56,6 @@ def test_parameters_delay_state_and_offset_are_found(numerator, denominator, int
     assert fit.offsets == (0.0,)
 
 
-def test_from_rest_without_noise_the_fit_is_exact():
-    record = integrating(2, [1, -0.5], [1, 0.5, 0], noise=0.0)
-    fit = DelayProfile(1, 1, (0, 2), integrators=1).fit(record)
-    np.testing.assert_allclose(fit.theta, [0.5, 0, 1, -0.5, 0.73], atol=1e-6)
-
-
 def test_robust_loss_fixed_coefficients_and_several_records():
     records = [integrating(seed, [1.5], [1, 0.5, 0], free=lambda t: 3.0 + 0.0 * t) for seed in (3, 4)]
     outliers = 5.0 * (np.arange(400) % 60 == 50)

@@ -141,8 +141,3 @@ def test_a_frequency_response_is_fitted_within_bounds():
 def test_what_cannot_be_bounded_is_refused(options, message):
     with pytest.raises(OptionError, match=message):
         DelayProfile(**{"poles": 2, "zeros": 0, "delay_bounds": (0.0, 0.0), **options})
-
-
-def test_a_bound_has_its_smaller_end_first():
-    with pytest.raises(OptionError, match="the smaller first"):
-        Bound("a1", 2.0, 1.0)

@@ -106,13 +106,13 @@ def test_two_records_share_one_noise():
 def test_orders_of_least_bic():
     """A model fits at least as well as those that it contains, and the true orders are usually chosen."""
     found = []
-    for seed in range(8):
+    for seed in range(3):
         v = drawn(FAST, 1000, seed)
         fits = all_arma([v], [steps_of(np.ones(1000, dtype=bool))], {})
         assert len(fits) == 16
         assert all(fits[p, q].deviance <= fits[p - 1, q].deviance + 0.01 for p, q in fits if p)
         found.append(min(fits.values(), key=lambda fit: fit.bic).orders)
-    assert found.count((2, 1)) >= 5
+    assert found.count((2, 1)) >= 2
 
 
 @pytest.mark.parametrize("ahead", [1, 4])

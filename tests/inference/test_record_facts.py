@@ -73,22 +73,6 @@ def test_a_clean_record_has_no_faults_and_its_numbers_hold_the_truth(colour, irr
         assert parts.signal_to_noise.low - 1 <= 18.2 <= parts.signal_to_noise.high + 1
 
 
-def test_false_alarms_are_as_rare_as_the_level_says():
-    alarms = sum(bool(stated(record_facts(clean(seed, n=300, hold=10)))) for seed in range(15))
-    # With five tests at .001, one alarm in 200 is expected.
-    assert alarms <= 1
-
-
-def test_sizes_are_those_of_the_faults():
-    offset, drift = (
-        record_facts(faulty("offset")).parts.offset,
-        record_facts(faulty("drift")).parts.drift,
-    )
-    assert offset.low <= 0.3 <= offset.high
-    assert drift.low <= 1.0 <= drift.high
-    assert offset.high - offset.low < 0.15
-
-
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_units_do_not_matter(scale):
     record = clean()
@@ -97,13 +81,6 @@ def test_units_do_not_matter(scale):
     assert scaled.parts.signal_to_noise == pytest.approx(facts.parts.signal_to_noise, rel=1e-4)
     assert scaled.parts.delay.high == pytest.approx(facts.parts.delay.high * scale)
     assert stated(scaled) == set()
-
-
-def test_an_output_far_from_zero_is_as_good():
-    record = clean()
-    facts = record_facts(replace(record, y=record.y + 1e6))
-    assert facts.parts.offset.value == pytest.approx(1e6)
-    assert facts.parts.signal_to_noise == pytest.approx(record_facts(record).parts.signal_to_noise, abs=0.5)
 
 
 def test_no_response_is_no_estimate():

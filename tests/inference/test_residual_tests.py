@@ -70,19 +70,6 @@ def test_a_sound_model_fails_at_the_stated_rate(numerator):
         assert 0.012 < rejected[0] / 300 < 0.088
 
 
-def test_the_statistic_does_not_see_what_estimation_removes():
-    rng = np.random.default_rng(4)
-    u = rng.standard_normal(400)
-    e = rng.standard_normal(400)
-    psi = lfilter([1.0, 0.5], [1.0, -0.6], u)[:, None]
-    e -= psi[:, 0] * (psi[:, 0] @ e) / (psi[:, 0] @ psi[:, 0])
-    here = residual_tests(e, u, sensitivities=psi)
-    # the colour of the residuals is estimated again, so the last digits differ
-    moved = residual_tests(e - 0.01 * psi[:, 0], u, sensitivities=psi)
-    assert moved.cross_statistic == pytest.approx(here.cross_statistic, rel=1e-3)
-    assert residual_tests(e - 0.2 * psi[:, 0], u).cross_statistic > here.cross_statistic + 5
-
-
 def test_missing_dynamics_and_feedback_are_told_apart():
     rng = np.random.default_rng(5)
     u, e = rng.standard_normal(1000), rng.standard_normal(1000)
@@ -93,13 +80,6 @@ def test_missing_dynamics_and_feedback_are_told_apart():
     early = residual_tests(e + 0.3 * np.roll(u, -4), u)
     assert not early.uncorrelated
     assert "feedback" in early.sentence
-
-
-def test_an_offset_is_not_white_but_no_dependence_on_the_input():
-    rng = np.random.default_rng(6)
-    tests = residual_tests(rng.standard_normal(1000) + 0.5, 3.0 + rng.standard_normal(1000))
-    assert not tests.white
-    assert tests.uncorrelated
 
 
 def test_nothing_to_test_is_said():
