@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctid_cli import HeldSignal, TransferFunction, simulate
-from tests.cli.records import first_order, write
+from tests.cli.records import write
 
 
 def answered(file, gain, seed=0):
@@ -49,18 +49,3 @@ def test_sums_of_submodels(ctid, tmp_path, snapshot, monkeypatch):
     typed = json.loads(ctid("fit", "modes.csv", *content["command"], "--json").stdout)
     chosen = json.loads(ctid("fit", "modes.csv", "--model", "additive", "--json").stdout)
     assert typed["parameters"] == chosen["parameters"]
-
-
-def test_noise_has_no_order(ctid, tmp_path):
-    record = answered(tmp_path / "noise.csv", 0.0)
-    done = ctid("order", record, "--poles", "1:2", "--zeros", "0", "--delay", "0:1", "--json", "--out", tmp_path)
-    content = json.loads(done.stdout)
-    assert content["recommended"] is None
-    assert content["reason"].startswith("There is no model here")
-
-
-def test_a_record_too_short_for_some_structures(ctid, tmp_path):
-    record = write(tmp_path / "short.csv", first_order(n=24), "t [s],u [V],y [mm]")
-    content = json.loads(ctid("order", record, "--json", "--out", tmp_path).stdout)
-    endings = {"CONVERGED", "AT_BOUND", "RIDGE", "DELAY_AT_BOUND", "STALLED"}
-    assert {each["status"] for each in content["orders"]} <= endings

@@ -72,13 +72,3 @@ def test_what_does_not_go_together_is_refused(record, tmp_path, options, message
     assert done.exit_code == ExitCode.BAD_INPUT
     assert message in " ".join(done.stderr.split())
     assert not list(tmp_path.iterdir())
-
-
-def test_a_page_names_each_input_and_claims_no_trial(ctid, record, tmp_path):
-    options = ("--poles", "u1=2", "--poles", "u2=1", "--zeros", 0, "--delay", 0.7, "--hold", "zoh")
-    ctid("fit", record, *BOTH, *options, "--report", "--out", tmp_path)
-    page = (tmp_path / "fit.html").read_text()
-    assert "u1 2 poles, no zero; u2 1 pole, no zero" in page
-    assert "on the input u1" in page
-    assert "on the input u2" in page
-    assert "no change that was tried" not in page

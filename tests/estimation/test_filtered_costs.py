@@ -199,16 +199,6 @@ def test_unstable_own_starts_are_reflected():
     assert costs[0].minimise(0.25, np.empty((0, 3)), True).theta[0] == pytest.approx(0.5, rel=1e-2)
 
 
-def test_minimum_is_the_best_of_its_starts():
-    cost = costs_of(make_record(snr_db=15, n=2000))[2]
-    starts = np.column_stack((theta_of(CASE_1) * np.array([[1.0], [1e-3]]), np.zeros(2)))
-    alone = [cost.minimise(7.7, start[None], False).squared_error for start in starts]
-    least_squares = cost.minimise(7.7, NONE, True).squared_error
-    assert cost.minimise(7.7, starts, False).squared_error == min(alone)
-    assert cost.minimise(7.7, starts, True).squared_error == min(*alone, least_squares)
-    assert cost.minimise(7.7, NONE, False).squared_error == np.inf
-
-
 def test_costs_behind_all_filters_are_handed_down_and_up():
     costs = costs_of(make_record(snr_db=5, n=2000))
     found = scan(costs[::-1], [6.5] * 3, own=False)

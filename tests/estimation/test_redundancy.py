@@ -73,14 +73,6 @@ def test_a_cost_that_is_not_finite_is_infinitely_bad(choice, bad):
     assert not found.status.succeeded
 
 
-@pytest.mark.parametrize("choice", CHOICES)
-def test_no_decrease_at_zero_or_below_goes_round_for_ever(choice):
-    # (1 - improvement) J0 equals J0 at zero, and is above J0 for negative J0.
-    for floor in (0.0, -5.0):
-        found = minimise_redundantly(3.0, lambda x, floor=floor: x + floor, [to(0.0), to(0.004)], choice=choice)
-        assert (found.point, found.rounds, found.status) == (0.0, 2, SearchStatus.EXHAUSTED)
-
-
 @pytest.mark.parametrize(("candidate", "accepted"), [(-5.004, False), (-5.006, True)])
 def test_share_of_a_negative_cost_is_a_share_of_its_size(candidate, accepted):
     found = minimise_redundantly(-5.0, float, [to(candidate)], improvement=1e-3)

@@ -29,6 +29,8 @@ TWO_MODES = modes([0.25, 0.25, 3.0, 0.01, 0.025, 1.0])
 PID = DiscreteController.from_pid(0.0115, 0.00725, 0.00454)
 #: The modes of a flexible beam as printed (section 7), and the initial values of its identification.
 BEAM = modes([0.0024, 0.023, 11.81, 2.33e-5, 1.65e-4, 0.159, 8.59e-7, 1.03e-5, 3.19e-4, 7.55e-7, 3.55e-6, 1.27e-4])
+
+
 def open_record(system, n, noise, seed, *, interval=INTERVAL, hold="zoh", times=None):
     """Return a record of Gaussian input and white output noise with a standard deviation."""
     rng = np.random.default_rng(seed)

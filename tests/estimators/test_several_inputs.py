@@ -124,15 +124,6 @@ def test_a_stored_fit_is_read_back_with_its_records(tmp_path):
         found.step_response()
 
 
-def test_inputs_that_differ_in_their_hold_share_a_finer_clock():
-    record = record_of(FIRST, SECOND)
-    smooth = HeldSignal(T, np.sin(T), "band-limited")
-    mixed = record.driven_by(u2=smooth)
-    y = simulate(FIRST, record.held["u1"], T) + simulate(SECOND, smooth, T)
-    fit = DelayProfile(2, 0, (0.0, 2.0), inputs=OWN).fit(replace(mixed, y=y))
-    assert fit.model.parts["u2"].delay == pytest.approx(SECOND.delay, abs=1e-3)
-
-
 @pytest.mark.parametrize(
     ("options", "second", "message"),
     [
@@ -148,8 +139,3 @@ def test_records_and_inputs_that_do_not_go_together_are_refused(options, second,
     record = record if changed is None else record.driven_by(u2=HeldSignal(T, changed))
     with pytest.raises((DataError, OptionError), match=message):
         DelayProfile(1, 0, (0.0, 2.0), **options).fit(record)
-
-
-def test_what_has_one_input_refuses_several():
-    with pytest.raises(DataError, match="inputs u1, u2, and this is available for one input only"):
-        record_of(FIRST, SECOND).input  # noqa: B018

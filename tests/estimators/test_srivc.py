@@ -127,15 +127,6 @@ def test_input_that_never_reaches_the_output_is_singular(estimator):
         estimator.fit(record)
 
 
-@pytest.mark.parametrize("regular", [True, False])
-def test_published_variant_returns_the_true_model_up_to_its_smallest_step(regular):
-    # The plain variant ends at delay steps of 1e-5 of the range, without the joint iterations of the guarded one.
-    fit = searched(CASE_1, tolerance=1e-12, variant="plain").fit(make_record(regular=regular), Start(8.2))
-    assert fit.status is Status.CONVERGED
-    assert abs(fit.model.delay - 8.0) < 1e-5 * 15
-    assert_same_model(fit.model, CASE_1, 1e-3)
-
-
 @pytest.mark.parametrize("start", [0.5, 4.0, 7.5, 10.0, 14.0])
 def test_a_local_minimum_is_called_one(start):
     # From the right basin the estimate converges; from the others, the cost at 8 s is lower.
@@ -186,11 +177,6 @@ def test_cost_falls_within_every_stage(lowpass):
     assert fit.history[-1].cost == pytest.approx(fit.cost, rel=1e-12)
     assert fit.history[-1].delay == fit.model.delay
     assert fit.iterations == len(fit.history) - len(stages)
-
-
-def test_without_a_start_the_middle_of_the_bounds_is_taken():
-    estimator, record = TdSrivc(2, 0, (6, 11)), make_record(snr_db=15, n=2000)
-    assert estimator.fit(record).history == estimator.fit(record, Start(8.5)).history
 
 
 @pytest.mark.parametrize(("bounds", "start", "bound"), [((0, 7.5), 7.2, 7.5), ((8.1, 12), 8.4, 8.1)])

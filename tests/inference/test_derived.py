@@ -123,13 +123,6 @@ def test_near_repeated_poles_are_undetermined():
     assert all("another pole" in row.reason for name, row in exact.items() if name != "static_gain")
 
 
-def test_a_pair_close_to_the_real_axis_keeps_frequency_and_damping():
-    rows = by_name(TransferFunction([1.0], [1.0, 1.999, 1.0]), np.diag([1e-2, 1e-2, 1e-2]) ** 2)
-    assert "another pole" in rows["pole_1_imag"].reason
-    assert rows["natural_frequency_1"].standard_error == pytest.approx(0.005, rel=1e-6)
-    assert rows["damping_1"].standard_error == pytest.approx(0.01 * np.hypot(0.5, 1.999 / 4), rel=1e-6)
-
-
 def test_frequency_and_damping_do_not_change_where_two_poles_meet_on_the_real_axis():
     rows = [
         by_name(AdditiveModel([Submodel([1.0], [0.25, 1.0 + change, 1.0])]), 1e-4 * np.eye(3))

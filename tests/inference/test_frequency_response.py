@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli import DataError, HeldSignal, Record, TransferFunction, simulate
-from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_frequency_response
+from ctid_cli.inference.frequency_response import estimate_frequency_response
 from ctid_cli.inference.spectral_methods import find_period
 from ctid_cli.signals.held import hold_factor
 
@@ -40,10 +40,6 @@ def sampled_response(model, w, hold="zoh"):
 def exact(model, w):
     s = 1j * w
     return np.polyval(model.numerator, s) / np.polyval(model.denominator, s) * np.exp(-s * model.delay)
-
-
-def covered(found: FrequencyResponse, true) -> float:
-    return float(np.mean(np.abs(found.response - true) <= found.radius()))
 
 
 def random_record(seed, n=2000, noise=0.3, model=MODEL, warm_up=300):

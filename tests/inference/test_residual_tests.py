@@ -70,18 +70,6 @@ def test_a_sound_model_fails_at_the_stated_rate(numerator):
         assert 0.012 < rejected[0] / 300 < 0.088
 
 
-def test_missing_dynamics_and_feedback_are_told_apart():
-    rng = np.random.default_rng(5)
-    u, e = rng.standard_normal(1000), rng.standard_normal(1000)
-    late = residual_tests(e + 0.3 * np.roll(u, 4), u)
-    assert not late.uncorrelated
-    assert np.argmax(np.abs(late.cross_correlation)) == late.lags + 4
-    assert "misses a part of the response" in late.sentence
-    early = residual_tests(e + 0.3 * np.roll(u, -4), u)
-    assert not early.uncorrelated
-    assert "feedback" in early.sentence
-
-
 def test_nothing_to_test_is_said():
     rng = np.random.default_rng(8)
     constant = residual_tests(rng.standard_normal(100), np.full(100, 0.1))

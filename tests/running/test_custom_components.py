@@ -197,10 +197,6 @@ def test_what_is_odd_on_the_first_data_set_is_a_warning(file, overrides, words):
     assert [word in text for text, word in zip(heard, words, strict=True)] == [True] * len(words)
 
 
-def test_a_component_that_ends_the_process_is_left_to_the_run(file):
-    assert planned(file, "estimators.bad.mischief=always").data_sets == 2
-
-
 def test_the_value_of_a_measure_is_stored_with_every_estimate_and_in_every_table(file, tmp_path):
     run(planned(file, *OWN, asked("Slowest")), tmp_path / "custom")
     estimates, out = read_estimates(tmp_path / "custom"), ("custom", "--out", tmp_path)

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from ctid_cli.inference.bounds import cramer_rao_bound, limiting_accuracy
-from ctid_cli.models.additive import AdditiveModel, Submodel
-from ctid_cli.models.controller import DiscreteController
+from ctid_cli.inference.bounds import cramer_rao_bound
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.running.plan import build_plan
 from ctid_cli.running.theory import expectations
@@ -47,14 +45,6 @@ def test_the_printed_variances_of_the_paper(accuracy):
     np.testing.assert_allclose(variances(found, "clsrivc", "a2"), [0.090118, 2.49911e-5], rtol=1e-4)
     direct, closed = variances(found, "direct", "b0"), variances(found, "clsrivc", "b0")
     np.testing.assert_allclose(1.01 * np.array(direct), closed, rtol=1e-6)
-
-
-def test_where_the_reference_enters(accuracy):
-    plant = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
-    controller = DiscreteController.from_pid(0.0115, 0.00725, 0.00454)
-    signals = {"standard_deviation": 1.0, "innovation_variance": 0.01, "samples": 19650, "enters": "input"}
-    expected = limiting_accuracy(plant, 0.05, controller, **signals).standard_errors
-    np.testing.assert_allclose(errors(accuracy("enters at the input"), "sum")[0], expected)
 
 
 def test_different_ways_to_the_same_numbers(accuracy, tmp_path):

@@ -8,7 +8,6 @@ import pytest
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
@@ -90,18 +89,6 @@ def test_longer_records_begin_with_the_shorter_ones_and_data_sets_repeat():
 def test_an_irregular_loop_is_refused():
     with pytest.raises(DataError, match="a closed loop needs a regular clock"):
         source(sampling=UniformIntervals(0.04, 0.06, 50)).dataset(0)
-
-
-@pytest.mark.parametrize("name", ["modes", "delayed modes", "rigid body and mode"])
-def test_open_loop_data_sets_of_submodels(name):
-    system = SYSTEMS[name]
-    sampling = UniformIntervals(0.04, 0.06, 300, input_record="exact")
-    record = SimulatedSource(system, Gaussian(clock_period=0.5), sampling, None, 5).dataset(0).record
-    total = np.zeros(300)
-    for submodel in system.submodels:
-        part = submodel.transfer_function()
-        total += simulate(TransferFunction(part.numerator, part.denominator, system.delay), record.input, record.t)
-    np.testing.assert_allclose(record.y, total, atol=1e-9)
 
 
 def test_a_measured_loop(tmp_path):

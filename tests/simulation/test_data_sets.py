@@ -62,11 +62,6 @@ def test_what_the_estimator_is_told_of_the_input():
     np.testing.assert_array_equal(sampled.input.values, exact.input.at(sampled.t))
 
 
-def test_without_noise_the_output_is_noise_free():
-    record = record_of("noise=null")
-    np.testing.assert_array_equal(record.y, record.noise_free)
-
-
 def test_random_starts():
     random = plan_of().starts[1]
     drawn = [random.draw(11, replicate).delay for replicate in range(50)]

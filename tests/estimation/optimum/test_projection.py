@@ -12,7 +12,6 @@ from ctid_cli.estimation.optimum.projection import Problem, project, slopes
 from ctid_cli.estimation.optimum.triangle import Columns, Delay, rows_of, triangle_of
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.models.additive import Term
-from ctid_cli.signals.record import Record
 from tests.estimation.optimum.dense import columns_of, left_over, squared_error
 from tests.estimation.optimum.systems import MODEL, record_of
 
@@ -101,15 +100,6 @@ def test_a_sample_belongs_to_the_cells_on_both_sides(cell):
     beyond = [project(problem, SPEED, DAMPING, Delay(2.0 + side * step, -1)).squared_error for step in (1e-5, 2e-5)]
     slope = side * (4 * beyond[0] - beyond[1] - 3 * here.squared_error) / 4e-5
     assert slopes(problem, SPEED, DAMPING, at, here, (0,)).gradient[-1] == pytest.approx(slope, rel=1e-5)
-
-
-def test_masked_samples_do_not_count():
-    record = record_of(MODEL, np.random.default_rng(5), noise=0.1)
-    y = record.y.copy()
-    y[[0, 1, 17, 18, 240]] = np.nan
-    masked = Record(record.t, y, record.input)
-    found = project(problem_of(masked, 2, True, True), SPEED, DAMPING, Delay(0.37, -1)).squared_error
-    np.testing.assert_allclose(found, squared_error(masked, DENOMINATOR, 2, 0.37, True, True), rtol=1e-8)
 
 
 @pytest.mark.parametrize(("free_response", "offset"), [(False, False), (True, False), (False, True), (True, True)])
