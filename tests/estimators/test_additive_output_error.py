@@ -29,10 +29,9 @@ def with_level(record, level):
     return replace(record, y=record.y + level)
 
 
-@pytest.mark.parametrize("several", [False, True])
-@pytest.mark.parametrize("treatment", TREATMENTS.values(), ids=TREATMENTS)
-def test_a_sum_of_one_mode_is_the_transfer_function(treatment, several):
-    records = [with_level(open_record(ONE, 500, 0.1, seed), 0.5 * seed) for seed in range(1 + several)]
+@pytest.mark.parametrize(("treatment", "count"), zip(TREATMENTS.values(), (1, 2, 1, 1, 1), strict=True), ids=TREATMENTS)
+def test_a_sum_of_one_mode_is_the_transfer_function(treatment, count):
+    records = [with_level(open_record(ONE, 300, 0.1, seed), 0.5 * seed) for seed in range(count)]
     additive = AdditiveOutputError((Term(2, 1),), (0.0, 0.5), **treatment).fit(records)
     fraction = DelayProfile(2, 1, (0.0, 0.5), **treatment).fit(records)
     assert additive.cost == pytest.approx(fraction.cost, rel=1e-9)
@@ -76,12 +75,3 @@ def test_a_known_coefficient_keeps_its_value_and_moves_the_optimum_to_where_it_i
 def test_a_start_of_other_submodels_is_refused():
     with pytest.raises(DataError, match="the start has the submodels"):
         AdditiveOutputError((MODE,)).fit(open_record(ONE, 100, 0.1, 8), Start(model=TWO))
-
-
-def test_the_order_of_terms_is_kept_and_equal_ones_rise_in_frequency():
-    slow = AdditiveModel([Submodel([0.5], [1.0, 1.0]), *TWO.submodels], 0.0)
-    terms = (MODE, Term(1, 0), MODE)
-    fit = AdditiveOutputError(terms).fit(open_record(slow, 1000, 0.01, 9))
-    assert fit.additive.terms == terms
-    assert fit.parameters["g1_a2"] == pytest.approx(0.25, rel=0.05)
-    assert fit.parameters["g2_a1"] == pytest.approx(1.0, rel=0.3)

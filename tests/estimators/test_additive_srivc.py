@@ -181,18 +181,6 @@ def test_order_of_the_terms_does_not_matter():
     assert one.additive.order_of_sorting == (0, 1, 2)
 
 
-def test_missing_samples_and_irregular_clocks_only_cost_accuracy():
-    rng = np.random.default_rng(10)
-    record = open_record(TWO_MODES, 3000, 0.2, 10)
-    masked = replace(record, y=np.where(rng.random(3000) < 0.1, np.nan, record.y))
-    irregular = open_record(TWO_MODES, 2000, 0.2, 11, times=np.cumsum(rng.uniform(0.02, 0.08, 2000)))
-    assert irregular.interval is None
-    for each, covariance in ((masked, "auto"), (irregular, "white"), (irregular, "sandwich")):
-        fit = fitted(each, (TWO_MODES, 1), covariance=covariance)
-        assert (fit.status, fit.count) == (Status.CONVERGED, np.isfinite(each.y).sum())
-        assert np.abs(deviations(fit, TWO_MODES)).max() < 4
-
-
 @pytest.mark.parametrize("instruments", ["open_loop", "closed_loop"])
 @pytest.mark.parametrize("system", [DRIVE, RIGID], ids=["integrator and pole", "rigid body"])
 def test_integrators(system, instruments):

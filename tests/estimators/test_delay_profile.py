@@ -159,16 +159,6 @@ def test_errors_of_a_model_with_its_own_state_and_offset(initial_state):
     assert applied.offsets == pytest.approx(fit.offsets, abs=1e-6)
 
 
-def test_squared_errors_around_the_estimate():
-    options = DelayProfile(2, 0, (0, 3))
-    prepared = options.prepare(record_of(noise=0.1, offset=0.4))
-    fit = prepared.fit()
-    lowest = fit.cost * fit.count
-    assert prepared.laid_out.squared_error_at(fit.model, fit.model.delay) == pytest.approx(lowest)
-    known = replace(options, delay_bounds=(0.6, 0.6)).fit(prepared.laid_out.records)
-    assert prepared.laid_out.squared_error_at(fit.model, 0.6) == pytest.approx(known.cost * known.count, rel=1e-6)
-
-
 # --- refusals --------------------------------------------------------------------------------------
 
 

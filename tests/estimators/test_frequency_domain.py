@@ -49,9 +49,7 @@ def noisy(model: TransferFunction, seed: int, level: float = 0.05) -> FrequencyD
     ("model", "interval", "most"),
     [
         (TransferFunction([1.0], [1.0, 1.0]), 0.1, 0.0),
-        (SECOND, 0.2, 0.0),
         (TransferFunction([2.0, 4.0], [1.0, 1.0, 4.0], 0.731), 0.2, 2.0),
-        (TransferFunction([2.0, 4.0], [1.0, 1.0, 4.0], 0.6), 0.2, 2.0),
         (TransferFunction([4.0], np.poly([-1.0, -1.0, -4.0, -30.0]), 0.31), 0.05, 2.0),
         (TransferFunction([1.0, 2.0, 1.0], [1.0, 1.0, 4.0], 0.5), 0.2, 0.5),
         (TransferFunction([2.0, 1.0], [1.0, 1.0, 0.0], 0.3), 0.1, 1.0),
@@ -136,12 +134,12 @@ def test_weights_do_not_matter_to_values_without_errors(weight):
 def test_noise_alone_is_no_model():
     rng = np.random.default_rng(5)
     seen = 0
-    for _ in range(20):
+    for _ in range(8):
         values = rng.standard_normal((2, LINES.size))
         data = FrequencyData(LINES, values[0] + 1j * values[1])
         found = identify_frequency_response(data, FrequencyDomain(1, 0))
         seen += found.answer.seen
-    assert seen <= 3
+    assert seen <= 2
     assert all(item.status != "free" for item in found.estimates) or found.answer.seen
 
 

@@ -149,13 +149,6 @@ def test_a_model_that_does_not_carry_over_is_said():
     assert any("does not carry over" in warning for warning in result.warnings)
 
 
-def test_validation_estimates_its_own_state_and_offset():
-    options = DelayProfile(1, 0, (0, 3), initial_state="estimate", offset="estimate")
-    result = identify([record_of(offset=3.0)], options, record_of(seed=1, offset=-7.0, past=50))
-    assert result.validation.applied.offsets[0] == pytest.approx(-7.0, abs=0.02)
-    assert result.validation.r2 > 0.9
-
-
 def test_where_no_answer_is_seen_the_first_warning_says_so():
     record = record_of(FIRST_ORDER, seed=3, n=300)
     noise = Record(record.t, np.random.default_rng(3).standard_normal(300), record.input)

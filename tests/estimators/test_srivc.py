@@ -163,22 +163,6 @@ def test_standard_errors_are_the_bound_at_the_estimate():
     assert list(fit.standard_errors) == ["a1", "a2", "b0", "delay"]
 
 
-@pytest.mark.parametrize("lowpass", [None, Lowpass(0.202, 2)])
-def test_cost_falls_within_every_stage(lowpass):
-    fit = searched(CASE_1, lowpass=lowpass).fit(make_record(snr_db=5), Start(7.0))
-    stages = {}
-    for entry in fit.history:
-        stages.setdefault(entry.stage, []).append(entry)
-    assert list(stages) == ["search"] + ["refine"] * (lowpass is not None) + ["joint"]
-    for entries in stages.values():
-        assert [entry.iteration for entry in entries] == list(range(len(entries)))
-        costs = np.array([entry.cost for entry in entries])
-        assert (np.diff(costs) <= 1e-12 * costs[0]).all()
-    assert fit.history[-1].cost == pytest.approx(fit.cost, rel=1e-12)
-    assert fit.history[-1].delay == fit.model.delay
-    assert fit.iterations == len(fit.history) - len(stages)
-
-
 @pytest.mark.parametrize(("bounds", "start", "bound"), [((0, 7.5), 7.2, 7.5), ((8.1, 12), 8.4, 8.1)])
 @pytest.mark.parametrize("variant", ["plain", "guarded"])
 def test_true_delay_beyond_a_bound_ends_at_the_bound(variant, bounds, start, bound):

@@ -186,16 +186,6 @@ def test_where_no_path_leads_lower_the_next_valleys_are_looked_at():
     assert fit.model.delay == pytest.approx(8.0, abs=0.01)
 
 
-def test_too_few_rounds_end_the_search(prepared):
-    record = make_record(snr_db=5, seed=5, replicate=2)
-    fit = UsefulRedundancy(**options(max_rounds=1)).fit(record, Start(3.0))
-    assert (fit.search.status, fit.search.rounds) == (SearchStatus.MAX_ROUNDS, 1)
-    assert {path.round for path in fit.paths} == {1}
-    longer = prepared.fit(Start(3.0))
-    assert longer.search.rounds > 1
-    assert longer.search.visits[: len(fit.search.visits)] == fit.search.visits
-
-
 # Bounds -----------------------------------------------------------------------------------------------
 
 
