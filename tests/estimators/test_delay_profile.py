@@ -1,7 +1,5 @@
 """Global search over the delay, and measured records: states, offsets, gaps, experiments, units."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 

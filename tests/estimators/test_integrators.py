@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import OptionError
-from ctid_cli.estimation.common import Fixed, Start
+from ctid_cli.estimation.common import Start
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.filtering.simulate import simulate

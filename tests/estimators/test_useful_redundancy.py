@@ -7,7 +7,6 @@ import pytest
 
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.filtered_costs import LATTICE, percents
-from ctid_cli.estimation.redundancy import SearchStatus
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.filtering.lowpass import Lowpass

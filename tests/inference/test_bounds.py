@@ -208,17 +208,6 @@ def spread(size):
     return root @ root.T
 
 
-def test_names_and_values():
-    fraction = unfactored(MODEL)
-    found = ParameterAccuracy.of(fraction, spread(7), delay=True)
-    assert found.names == ("a1", "a2", "a3", "b0", "b1", "b2", "delay")
-    np.testing.assert_array_equal(found.values, [*fraction.denominator[1:], *fraction.numerator, 0.4])
-    found = ParameterAccuracy.of(TransferFunction([3.0], [1.0, 1.0, 2.0]), spread(4), zeros=1)
-    assert found.names == ("a1", "a2", "b0", "b1")
-    np.testing.assert_array_equal(found.values, [1, 2, 0, 3])
-    assert ParameterAccuracy.of(MODEL, spread(6)).names == MODEL.names
-
-
 @pytest.mark.parametrize("delay", [0, 1])
 def test_factoring_undoes_the_sum(delay):
     # The covariance of the sum's coefficients, computed from that of the submodels, is converted back.

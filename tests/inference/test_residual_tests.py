@@ -106,13 +106,6 @@ def test_the_rest_is_that_of_least_squares(count):
     assert orthonormal(parts).shape == (4, 3)
 
 
-def test_a_column_of_zeros_has_no_weight():
-    for _ in range(50):
-        weights = orthonormal(np.insert(RNG.standard_normal((40, 5)), 2, 0.0, axis=1))
-        assert weights.shape == (6, 5)
-        assert np.abs(weights[2]).max() < 1e-12
-
-
 def test_dependence_is_the_chi_square_form_of_dense_matrices():
     count, noise = 2 * ROWS + 5, NoiseModel(np.array([1.0, -0.6]), np.array([1.0, 0.6]) / 0.64, 1.0)
     e, columns, beside = (RNG.standard_normal((count, width)) for width in (1, 4, 2))

@@ -50,7 +50,7 @@ def test_noise_seldom_passes_for_an_answer():
     rng = np.random.default_rng(41)
     found = [
         outcome(record_of(u, noise(rng, 120, colour))).seen
-        for _ in range(4)
+        for _ in range(2)
         for colour in COLOURS
         for u in inputs(rng, 120)
     ]
@@ -84,16 +84,6 @@ def test_the_share_is_that_of_least_squares(initial_state):
         best = max(best, 1 - float(rest @ rest) / float(left @ left))
     found = outcome(record, delays=(4.0, 4.0), initial_state=initial_state)
     assert found.explained == pytest.approx(best, rel=1e-6)
-
-
-def test_a_clock_with_holes_and_an_irregular_one():
-    rng = np.random.default_rng(46)
-    record = answering(rng)
-    y = np.where(rng.random(400) < 0.3, np.nan, record.y)
-    assert outcome(record_of(record.input.values, y)).seen
-    t = np.cumsum(rng.uniform(0.2, 1.8, 400))
-    x = simulate(FIRST_ORDER, record.input, t)
-    assert outcome(Record(t, x / x.std() + noise(rng, 400), record.input)).seen
 
 
 def test_a_long_record_is_averaged_and_a_fast_answer_is_still_seen():
