@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.storage.columns import parameter_names
 from ctid_cli.storage.estimates import export_rows, read_estimates, read_stored
 from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.folder import experiment_folders
@@ -174,23 +173,6 @@ def test_success_rule(
     assert (None if hits is None else hits.tolist()) == (None if expected is None else [expected])
 
 
-def test_coefficients_go_with_their_errors_by_their_power_of_s() -> None:
-    errors = {"b0": 0.3, "b1": 0.4, "a1": 0.1}
-    model = {"numerator": [9.0, 2.0], "denominator": [1.0, 3.0], "standard_errors": errors}
-    dropped = model | {"numerator": [2.0]}
-    two_zeros = {"numerator": [2.0], "denominator": [1.0, 3.0]}
-    arrays = arrays_of_rows([model, dropped, {"delay": 0.5}, two_zeros])
-    nan = np.nan
-    for names, values, deviations in (
-        (("b0", "a1"), [[2, 3], [2, 3], [nan] * 2, [2, 3]], [[0.4, 0.1], [0.4, 0.1], [nan] * 2, [nan] * 2]),
-        (("b0", "b1", "a1"), [[9, 2, 3], [0, 2, 3], [nan] * 3, [0, 2, 3]], None),
-    ):
-        found = found_under(names, arrays, 4)
-        np.testing.assert_array_equal(found.values, np.array(values, dtype=float))
-        if deviations is not None:
-            np.testing.assert_array_equal(found.standard_errors, np.array(deviations))
-
-
 def test_true_values_are_those_of_the_estimated_form() -> None:
     submodels = [{"numerator": [2.0], "denominator": [0.1, 1.0]}, {"numerator": [3.0], "denominator": [2.0, 1.0]}]
     # Monic, and sums of submodels by ascending natural frequency.
@@ -216,8 +198,3 @@ def test_flat_tables_have_one_number_in_a_cell(place: Path) -> None:
     assert flat["a1"].tolist()[:4] == [2.0, 2.0, 2.0 + 1 / 3, 2.0 + 1 / 3]
     frame = pd.DataFrame({"a1": [1], "numerator": [[1.0]], "parameters": [{"a1": 3.0, "g1_a1": 4.0}]})
     assert export_rows(frame).iloc[0].to_dict() == {"a1": 1, "b0": 1.0, "parameters.a1": 3.0, "g1_a1": 4.0}
-
-
-def test_names_of_parameters_have_one_order() -> None:
-    found = [{"x": 1.0, "delay": 1.0, "g2_a1": 1.0, "a2": 1.0}, None, {"b1": 1.0, "a1": 1.0, "g1_b0": 1.0, "b0": 1.0}]
-    assert parameter_names(found) == ["b0", "b1", "a1", "a2", "g1_b0", "g2_a1", "delay", "x"]

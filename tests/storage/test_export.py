@@ -92,7 +92,7 @@ def test_extreme_contents_come_back(tmp_path: Path) -> None:
 
 def test_every_flipped_bit_of_data_is_found_without_a_journal(path: Path) -> None:
     intact, rng, found = path.read_bytes(), np.random.default_rng(5), 0
-    positions = rng.integers(0, len(intact), 300).tolist()
+    positions = rng.integers(0, len(intact), 120).tolist()
     for position in positions:
         damaged = bytearray(intact)
         damaged[position] ^= 1 << int(rng.integers(8))
@@ -101,7 +101,7 @@ def test_every_flipped_bit_of_data_is_found_without_a_journal(path: Path) -> Non
             assert read(path) == RESULTS, "what HDF5 does not use"
         except (StorageError, RefusedError):
             found += 1
-    assert found > 100
+    assert found > 40
     path.write_bytes(intact[: len(intact) // 2])
     with pytest.raises(StorageError, match=r"cannot be read"):
         read(path)
