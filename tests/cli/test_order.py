@@ -9,7 +9,7 @@ from ctid_cli import HeldSignal, TransferFunction, simulate
 from tests.cli.records import write
 
 
-def answered(file, gain, seed=0):
+def response_record(file, gain, seed=0):
     rng = np.random.default_rng(seed)
     t = 0.1 * np.arange(500)
     u = np.repeat(rng.choice([-1.0, 1.0], 100), 5)
@@ -19,12 +19,12 @@ def answered(file, gain, seed=0):
 
 @pytest.fixture
 def record(tmp_path):
-    return answered(tmp_path / "record.csv", 1.0)
+    return response_record(tmp_path / "record.csv", 1.0)
 
 
 def test_table_and_files(ctid, record, tmp_path, monkeypatch, snapshot):
     monkeypatch.chdir(tmp_path)
-    answered(tmp_path / "other.csv", 1.0, 1)
+    response_record(tmp_path / "other.csv", 1.0, 1)
     options = ("--poles", "1:2", "--zeros", "0:1", "--validate", "other.csv", "--out", "new")
     assert ctid("order", "record.csv", *options).stdout == snapshot
     content = json.loads((tmp_path / "new" / "order.json").read_text(encoding="utf-8"))

@@ -38,7 +38,7 @@ def test_run_runs_the_specifications_of_what_is_named(ctid, tmp_path, monkeypatc
     assert {(call["runs"], call["jobs"], call["place"].out) for call in calls} == {(3, 1, tmp_path)}
 
 
-def test_what_is_unwise_in_published_specifications_is_not_said_to_who_reproduces_them(capsys):
+def test_warnings_about_published_specifications_are_not_printed(capsys):
     for specs, said in ((SpecOptions(), "warning: "), (PublishedSpecs(), "")):
         specs.plans([CONFIGS / "case1_irregular.yaml"])
         assert capsys.readouterr().err[:9] == said

@@ -35,7 +35,7 @@ def untimed(text):
 
 
 @pytest.mark.usefixtures("without_workers")
-def test_what_is_said_of_a_run_of_another_one_and_of_none(ctid, here, snapshot):
+def test_messages_of_runs(ctid, here, snapshot):
     said = [
         ctid("run tiny.yaml --runs 1 --set noise.snr_db=20"),
         ctid("run tiny.yaml --runs 1 --set noise.snr_db=20"),

@@ -79,7 +79,7 @@ def test_share_of_a_negative_cost_is_a_share_of_its_size(candidate, accepted):
     assert found.visits[1].accepted is accepted
 
 
-def test_reference_is_asked_once_for_each_visit():
+def test_the_reference_cost_is_evaluated_once_for_each_visit():
     asked = []
 
     def reference(x):

@@ -94,7 +94,7 @@ def test_a_delay_at_its_bound_has_no_standard_error():
     assert "The delay lies at the end of its range, 0.4 s: with --delay 0:" in result.warnings[0]
 
 
-def test_a_zero_beside_a_delay_is_undetermined():
+def test_a_small_zero_and_a_delay_are_undetermined():
     """A small zero shifts the response like a delay: the pair is singular at b0 = 0."""
     smooth = TransferFunction([4.0], [1.0, 4.0, 4.0], 0.5)
     result = identify([record_of(smooth, noise=0.02)], DelayProfile(2, 1, (0, 3)))
@@ -140,7 +140,7 @@ def test_what_should_be_estimated_too_is_named(changes, option, silent):
     assert not any(option in warning for warning in better.warnings)
 
 
-def test_a_model_that_does_not_carry_over_is_said():
+def test_a_model_that_fails_validation_is_reported():
     other = record_of(TransferFunction([-1.0], [1.0, 2.0], 0.55), seed=1)
     result = identify([record_of()], OPTIONS, other)
     x = simulate(result.fit.model, other.input, other.t)
@@ -149,7 +149,7 @@ def test_a_model_that_does_not_carry_over_is_said():
     assert any("does not carry over" in warning for warning in result.warnings)
 
 
-def test_where_no_answer_is_seen_the_first_warning_says_so():
+def test_without_a_response_the_first_warning_says_so():
     record = record_of(FIRST_ORDER, seed=3, n=300)
     noise = Record(record.t, np.random.default_rng(3).standard_normal(300), record.input)
     result = identify([noise], DelayProfile(1, 0, (0, 3), offset="estimate"))
@@ -189,7 +189,7 @@ def test_a_pole_at_the_border_is_held_and_the_others_have_standard_errors():
     assert sum("Held at the border" in warning for warning in result.warnings) == 1
 
 
-def test_a_record_too_short_for_its_noise_is_said():
+def test_a_record_too_short_for_its_noise_is_reported():
     options = DelayProfile(1, 0, (0.55, 0.55), offset="drift")
     result = identify([record_of(n=60, colour=0.99, noise=0.02, seed=1)], options)
     assert any("The record is short for its noise" in warning for warning in result.warnings)

@@ -102,7 +102,7 @@ def test_predictions_on_the_own_record_are_those_of_the_fit(missing):
         found.predict(record, 0)
 
 
-def test_the_noise_model_is_chosen_and_what_it_gives_is_seen():
+def test_the_noise_model_is_chosen_and_increases_the_accuracy():
     found = identify([record_of(SLOW, n=600)], Rivc(2, 0, (0.0, 2.0)))
     assert found.fit.noise.chosen
     assert found.fit.noise.orders == (2, 1)

@@ -173,7 +173,7 @@ def test_search_tells_how_it_went():
     assert fit.switches == search.switches
 
 
-def test_where_no_path_leads_lower_the_next_valleys_are_looked_at():
+def test_without_a_descending_path_the_next_valleys_are_searched():
     # Two filters are too few for this start: J0 is above 25 % at their ends, and new paths start one period away.
     record = make_record(snr_db=5, seed=5, replicate=2, n=2500)
     fit = UsefulRedundancy(**options(filters=2, beta=2.0)).fit(record, Start(14.0))

@@ -175,7 +175,7 @@ DIRECTION = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, 2.0], [0.0, 2.0, 4.0]])
         ),
     ],
 )
-def test_what_is_said_of_a_covariance(C, theta, names, number, hessian, words):
+def test_descriptions_of_conditioning(C, theta, names, number, hessian, words):
     if hessian is None:
         hessian = np.linalg.inv(C) if np.isfinite(C).all() else UNDEFINED
     found = describe_conditioning(C, np.array(theta, dtype=float), names, number, np.asarray(hessian, dtype=float))

@@ -96,7 +96,7 @@ def test_near_repeated_poles_are_undetermined():
     assert all("another pole" in row.reason for name, row in exact.items() if name != "static_gain")
 
 
-def test_integrators_and_undefined_covariances_are_said():
+def test_integrators_and_undefined_covariances_have_reasons():
     fraction = by_name(TransferFunction([1.0], [1.0, 2.0, 0.0]), np.diag([1e-4, 1e-4, 1e-4]))
     assert fraction["time_constant_2"].estimate == np.inf
     assert "origin" in fraction["time_constant_2"].reason

@@ -115,7 +115,7 @@ def test_what_is_held_is_known_and_what_is_not_defined_is_nan():
     assert np.isnan(unknown.poles().standard_error).all()
 
 
-def test_poles_that_cannot_be_told_apart_have_no_error():
+def test_indistinguishable_poles_have_no_standard_error():
     fit = fitted(TransferFunction([1.0], [1.0, 2.001, 1.001]), ("a1", "a2", "b0"), covariance=1e-4 * np.eye(3))
     assert np.isnan(fit.poles().standard_error).all()
     single = fitted(TransferFunction([1.0], [1.0, 2.0]), ("a1", "b0"), covariance=np.eye(2)).poles()

@@ -70,7 +70,7 @@ def test_a_sound_model_fails_at_the_stated_rate(numerator):
         assert 0.012 < rejected[0] / 300 < 0.088
 
 
-def test_nothing_to_test_is_said():
+def test_signals_without_variation_are_not_tested():
     rng = np.random.default_rng(8)
     constant = residual_tests(rng.standard_normal(100), np.full(100, 0.1))
     assert np.isnan(constant.cross_p_value)
@@ -120,7 +120,7 @@ def test_dependence_is_the_chi_square_form_of_dense_matrices():
 N = 600
 
 
-def looked_at(rng, *, colour=0.0, pole=0.0, feedback=0.0):
+def tested(rng, *, colour=0.0, pole=0.0, feedback=0.0):
     """Return the tests of the errors of a first-order model with known parameters."""
     e = lfilter([1.0], [1.0, -colour], rng.standard_normal(N))
     r = np.repeat(rng.choice([-3.0, 3.0], N // 4), 4)
@@ -132,18 +132,18 @@ def looked_at(rng, *, colour=0.0, pole=0.0, feedback=0.0):
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.8])
-def test_false_alarms_are_as_rare_as_said(colour):
+def test_false_alarms_have_the_nominal_level(colour):
     rng = np.random.default_rng(7)
-    found = [looked_at(rng, colour=colour) for _ in range(150)]
+    found = [tested(rng, colour=colour) for _ in range(150)]
     # Both levels are approximate: at most twice the nominal one, with a confidence of 99.9 %.
     most = binom.ppf(0.999, len(found), 0.1)
     assert sum(one.pole_p_value < 0.05 for one in found) <= most
     assert sum(one.feedback_p_value < 0.05 for one in found) <= most
 
 
-def test_dynamics_that_are_missed_and_feedback_are_told_apart():
+def test_missing_dynamics_and_feedback_are_distinguished():
     rng = np.random.default_rng(8)
-    poor, looped = looked_at(rng, pole=1.0), looked_at(rng, feedback=0.3)
+    poor, looped = tested(rng, pole=1.0), tested(rng, feedback=0.3)
     assert poor.pole_p_value < 1e-6 < 1e-2 < poor.feedback_p_value
     assert poor.pole_share > 0.1
     assert looped.feedback_p_value < 1e-6 < 1e-2 < looped.pole_p_value

@@ -39,14 +39,14 @@ def outcome(*records, delays=(0.0, 10.0), **options):
     return module.response_test(records, [record.valid for record in records], delays, **options)
 
 
-def answering(rng, n=400, share=0.36, colour=(1.0,), model=FIRST_ORDER):
+def record_with_response(rng, n=400, share=0.36, colour=(1.0,), model=FIRST_ORDER):
     """Return a record in which the model explains a fraction of the output variance."""
     u = next(inputs(rng, n))
     x = simulate(model, HeldSignal(np.arange(float(n)), u), np.arange(float(n)))
     return record_of(u, np.sqrt(share) * x / x.std() + np.sqrt(1 - share) * noise(rng, n, colour))
 
 
-def test_noise_seldom_passes_for_an_answer():
+def test_false_detections_in_noise_have_the_nominal_level():
     rng = np.random.default_rng(41)
     found = [
         outcome(record_of(u, noise(rng, 120, colour))).seen
@@ -61,9 +61,9 @@ def test_noise_seldom_passes_for_an_answer():
 
 
 @pytest.mark.parametrize("colour", [COLOURS[0], COLOURS[2]])
-def test_an_answer_that_fits_20_percent_is_seen(colour):
+def test_a_response_with_a_fit_of_20_percent_is_detected(colour):
     rng = np.random.default_rng(42)
-    found = [outcome(answering(rng, 500, colour=colour)).seen for _ in range(12)]
+    found = [outcome(record_with_response(rng, 500, colour=colour)).seen for _ in range(12)]
     # With a power of 95 %, at most two are missed in 98 of 100 such samples.
     assert sum(found) >= 10
 
@@ -71,7 +71,7 @@ def test_an_answer_that_fits_20_percent_is_seen(colour):
 @pytest.mark.parametrize("initial_state", ["rest", "estimate"])
 def test_the_share_is_that_of_least_squares(initial_state):
     rng = np.random.default_rng(43)
-    record = answering(rng, 100)
+    record = record_with_response(rng, 100)
     t, y, best = record.t, record.y - record.y.mean(), 0.0
     for pole in module._poles(1.0, 99.0):
         denominator = np.real(np.poly([pole, pole.conjugate()] if np.imag(pole) else [pole]))
@@ -86,7 +86,7 @@ def test_the_share_is_that_of_least_squares(initial_state):
     assert found.explained == pytest.approx(best, rel=1e-6)
 
 
-def test_a_long_record_is_averaged_and_a_fast_answer_is_still_seen():
+def test_a_fast_response_in_a_long_record_is_detected():
     rng = np.random.default_rng(47)
     u = rng.choice([-1.0, 1.0], 9000)
     assert outcome(record_of(u, np.append(0.0, u[:-1]) + noise(rng, 9000))).seen
@@ -94,7 +94,7 @@ def test_a_long_record_is_averaged_and_a_fast_answer_is_still_seen():
 
 
 @pytest.mark.parametrize("model", [([1.0], [1.0, 0.0]), ([1.0], [1.0, 0.005, 0.25]), ([-0.1, 0.01], [1.0, 0.2, 0.01])])
-def test_without_noise_an_answer_is_always_seen(model):
+def test_a_response_without_noise_is_detected(model):
     """Integrating and lightly damped systems, and one with a zero in the right half plane."""
     rng = np.random.default_rng(48)
     t = np.arange(300.0)
@@ -122,7 +122,7 @@ def test_what_cannot_be_tested_is_not_denied():
     # From rest, a constant input is a step.
     assert np.isfinite(outcome(held).p_value)
     still = Record(held.t, held.y, HeldSignal(held.t - 1e6, np.zeros(100)))
-    for found in (outcome(still), outcome(answering(rng, 7))):
+    for found in (outcome(still), outcome(record_with_response(rng, 7))):
         assert np.isnan(found.p_value)
         assert found.seen
     assert outcome(record_of(next(inputs(rng, 100)), np.full(100, 3.0))).p_value == 1.0

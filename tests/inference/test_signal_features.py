@@ -6,7 +6,7 @@ import pytest
 from ctid_cli.inference.signal_features import growth_time, outliers, residual_outliers, saturated
 
 
-def test_one_sample_in_twenty_may_be_wild():
+def test_one_sample_in_twenty_may_be_an_outlier():
     rng = np.random.default_rng(0)
     y = rng.standard_normal(300)
     wild = 5 + 20 * np.arange(14)

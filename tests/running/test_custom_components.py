@@ -172,7 +172,7 @@ def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(fil
         ([*OWN, asked("Random")], "measures.Random: depends on the global random state"),
     ],
 )
-def test_what_shows_on_the_first_data_set_is_said_before_the_run(file, overrides, said):
+def test_errors_on_the_first_data_set_are_raised_before_the_run(file, overrides, said):
     with pytest.raises(SpecError, match=said):
         planned(file, *overrides)
 

@@ -323,7 +323,7 @@ def test_refused_folders_stay_as_they_are(
     assert snapshot(tmp_path) == before
 
 
-def test_a_second_run_is_refused_and_told_who_runs(tmp_path: Path, start: Start) -> None:
+def test_a_second_run_is_refused_and_the_running_process_is_named(tmp_path: Path, start: Start) -> None:
     place = tmp_path / "toys"
     process = start(place, 2, "--runs=500")
     read_ids(process, 2)

@@ -54,7 +54,7 @@ def test_replicates_differ_and_repeat():
     np.testing.assert_array_equal(sent.dataset(0).record.y, first.y)
 
 
-def test_what_the_estimator_is_told_of_the_input():
+def test_the_input_record_is_sampled_or_exact():
     sampled, exact = record_of(), record_of("sampling.input_record=exact")
     np.testing.assert_array_equal(sampled.noise_free, exact.noise_free)
     np.testing.assert_array_equal(sampled.input.t, sampled.t)

@@ -59,7 +59,7 @@ def test_open_loop_with_integrators(tmp_path):
     assert record.n_samples == 500
 
 
-def test_fractions_are_taken_apart_as_the_sorted_system_is(tmp_path):
+def test_fractions_are_factored_like_the_sorted_system(tmp_path):
     system = "system.additive=[{numerator: [1], denominator: [0.1, 1]}, {numerator: [3], denominator: [0.2, 0.3, 1]}]"
     rest = ["loop=null", "excitation={kind: gaussian}", "starts=null"]
     one = "estimators={one: {kind: srivc, poles: 3, zeros: 2}}"

@@ -175,7 +175,7 @@ def test_it_is_written_once_and_again_when_it_is_not_what_was_written(path: Path
     log.close()
 
 
-def test_a_full_disk_is_said_in_one_sentence_and_leaves_nothing_behind(path: Path) -> None:
+def test_a_full_disk_gives_one_sentence_and_leaves_no_file(path: Path) -> None:
     log, most = open_journal(path.with_name("journal.sqlite")), resource.getrlimit(resource.RLIMIT_FSIZE)
     path.unlink()
     before = {file.name for file in path.parent.iterdir()}

@@ -65,7 +65,7 @@ def test_a_superfluous_pole_runs_to_infinity():
     assert two.denominator.size == 2
 
 
-def test_the_model_has_the_squared_error_that_is_said():
+def test_the_model_has_the_reported_squared_error():
     rng = np.random.default_rng(5)
     record = record_of(random_model(rng, 3, 2, 0.6), rng, noise=0.3, offset=2.0)
     data = filter_data(record, 2.0)
