@@ -120,7 +120,7 @@ def test_dependence_is_the_chi_square_form_of_dense_matrices():
 N = 600
 
 
-def tested(rng, *, colour=0.0, pole=0.0, feedback=0.0):
+def input_tests(rng, *, colour=0.0, pole=0.0, feedback=0.0):
     """Return the tests of the errors of a first-order model with known parameters."""
     e = lfilter([1.0], [1.0, -colour], rng.standard_normal(N))
     r = np.repeat(rng.choice([-3.0, 3.0], N // 4), 4)
@@ -134,7 +134,7 @@ def tested(rng, *, colour=0.0, pole=0.0, feedback=0.0):
 @pytest.mark.parametrize("colour", [0.0, 0.8])
 def test_false_alarms_have_the_nominal_level(colour):
     rng = np.random.default_rng(7)
-    found = [tested(rng, colour=colour) for _ in range(150)]
+    found = [input_tests(rng, colour=colour) for _ in range(150)]
     # Both levels are approximate: at most twice the nominal one, with a confidence of 99.9 %.
     most = binom.ppf(0.999, len(found), 0.1)
     assert sum(one.pole_p_value < 0.05 for one in found) <= most
@@ -143,7 +143,7 @@ def test_false_alarms_have_the_nominal_level(colour):
 
 def test_missing_dynamics_and_feedback_are_distinguished():
     rng = np.random.default_rng(8)
-    poor, looped = tested(rng, pole=1.0), tested(rng, feedback=0.3)
+    poor, looped = input_tests(rng, pole=1.0), input_tests(rng, feedback=0.3)
     assert poor.pole_p_value < 1e-6 < 1e-2 < poor.feedback_p_value
     assert poor.pole_share > 0.1
     assert looped.feedback_p_value < 1e-6 < 1e-2 < looped.pole_p_value
