@@ -248,13 +248,6 @@ def test_history_and_report_are_those_of_the_simulated_model():
     assert "given" in fit.start_method
 
 
-def test_unstable_start_is_reflected():
-    start = modes([-0.25, 0.26, 2.9, 0.0102, 0.0253, 1.05])
-    fit = fitted(open_record(TWO_MODES, 2000, 0.1, 14), start)
-    assert fit.status is Status.CONVERGED
-    assert np.abs(deviations(fit, TWO_MODES)).max() < 4
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

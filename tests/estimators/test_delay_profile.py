@@ -101,17 +101,6 @@ def test_as_many_zeros_as_poles_with_a_known_delay():
         DelayProfile(2, 2, (0, 1))
 
 
-def test_masked_samples_and_gaps_do_not_bias():
-    whole = record_of(n=1500)
-    y = whole.y.copy()
-    y[::7] = np.nan
-    y[400:520] = np.nan
-    fit = DelayProfile(2, 0, (0, 3)).fit(Record(whole.t, y, whole.input))
-    assert_same_model(fit.model, SYSTEM, 1e-6)
-    np.testing.assert_array_equal(fit.used[0], np.isfinite(y))
-    assert fit.count == fit.residuals[0].size == np.isfinite(y).sum()
-
-
 # --- several experiments ---------------------------------------------------------------------------
 
 

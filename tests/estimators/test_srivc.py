@@ -11,7 +11,6 @@ from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.bounds import cramer_rao_bound
-from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.fit import Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
@@ -76,20 +75,6 @@ def test_fine_sampling_makes_the_state_variable_filter_exact(hold_output):
         errors.append(abs(fit.model.denominator[2] / 4.0 - 1))
     order = np.log2(np.array(errors[:-1]) / errors[1:])
     assert (order > (1.8 if hold_output == "foh" else 0.8)).all()
-
-
-@pytest.mark.parametrize("estimator", [Svf, Srivc])
-def test_report_is_that_of_the_simulated_model(estimator):
-    # Cost and fit of the samples after the delay, recomputed by simulation.
-    record = make_record(snr_db=15)
-    fit = known(CASE_1, estimator).fit(record)
-    used = record.t >= 8.0 - 1e-9
-    y, x = record.y[used], simulate(fit.model, record.input, record.t)[used]
-    assert fit.count == used.sum()
-    assert fit.cost == pytest.approx(np.mean((y - x) ** 2), rel=1e-9)
-    assert fit.r2 == pytest.approx(r_squared(y, x), rel=1e-9)
-    assert fit.fit_percent == pytest.approx(fit_percent(y, x), rel=1e-9)
-    assert fit.model.delay == 8.0
 
 
 def test_too_few_iterations_say_so():

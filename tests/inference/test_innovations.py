@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.linalg import toeplitz
 from scipy.optimize import approx_fprime
-from scipy.signal import lfilter
 
 from ctid_cli.errors import OptionError
 from ctid_cli.inference.innovations import (
@@ -113,21 +112,6 @@ def test_orders_of_least_bic():
         assert all(fits[p, q].deviance <= fits[p - 1, q].deviance + 0.01 for p, q in fits if p)
         found.append(min(fits.values(), key=lambda fit: fit.bic).orders)
     assert found.count((2, 1)) >= 2
-
-
-@pytest.mark.parametrize("ahead", [1, 4])
-def test_predictions_go_on_without_innovations(ahead):
-    """Direct simulation: the filter's response to the innovations up to then, and to zeros after."""
-    v = drawn(FAST, 300)
-    (noise,) = sampled(FAST, [np.ones(300, dtype=bool)])
-    e = lfilter(FAST.denominator, FAST.numerator, v)
-    predicted = noise.predicted(v, ahead)
-    for t in (200, 250, 299):
-        known = e.copy()
-        known[t - ahead + 1 :] = 0.0
-        # The effect of the zeros before the first sample has vanished after 200 samples: .9^200 < 1e-9.
-        assert predicted[t] == pytest.approx(lfilter(FAST.numerator, FAST.denominator, known)[t], abs=1e-7)
-    np.testing.assert_array_equal(predicted[:ahead], 0.0)
 
 
 def test_predictions_across_missing_samples_are_conditional_means():
