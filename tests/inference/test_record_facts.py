@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from ctid_cli import HeldSignal, Record, TransferFunction, simulate
-from ctid_cli.inference.input_response import analyse_response
+from ctid_cli.inference.input_response import analyse_response, regular_grid
 from ctid_cli.inference.record_facts import excitation_order, record_facts
 from ctid_cli.inference.record_tests import LEVEL
 from ctid_cli.inference.signal_features import input_moves
@@ -123,3 +123,10 @@ def test_gaps_and_periods():
     assert record_facts(Record.from_arrays(t, u, x)).input_period == pytest.approx(10.0)
     (gap,) = record_facts(Record.from_arrays(t[keep], u[keep], x[keep])).gaps
     assert (gap.start, gap.length) == (pytest.approx(29.9), pytest.approx(10.1))
+
+
+def test_the_signals_on_the_grid_have_neither_mean_nor_slope():
+    record = clean(n=300)
+    grid = regular_grid(replace(record, y=record.y + 3.0 + 0.2 * record.t))
+    lines = np.column_stack((np.ones(300), np.linspace(-1.0, 1.0, 300)))
+    np.testing.assert_allclose(lines.T @ np.column_stack((grid.u, grid.y)), 0.0, atol=1e-9)
