@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctid_cli import HeldSignal, Record, TransferFunction, identify, load_fit, save_fit, simulate
-from ctid_cli.errors import DataError, OptionError, UsageError
+from ctid_cli import HeldSignal, Record, TransferFunction, simulate
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Fixed
 from ctid_cli.estimation.measured_records import sensitivities
 from ctid_cli.estimation.optimum.box import box_of, point_of
@@ -106,21 +106,6 @@ def test_sensitivities_are_the_derivatives_of_the_output(name):
         step = 1e-6 * max(abs(theta[k]), 0.1) * np.eye(theta.size)[k]
         slope = (errors(theta - step) - errors(theta + step)) / (2.0 * step[k])
         np.testing.assert_allclose(psi[:, k], slope, atol=1e-4 * np.abs(slope).max())
-
-
-def test_a_stored_fit_is_read_back_with_its_records(tmp_path):
-    record = record_of(FIRST, SECOND)
-    known = tuple(replace(one, delay_bounds=(tau, tau)) for one, tau in zip(OWN, (0.73, 1.21), strict=True))
-    found = identify(record, DelayProfile(2, 0, (0.0, 2.0), inputs=known), record)
-    save_fit(found, tmp_path / "fit.json")
-    again = load_fit(tmp_path / "fit.json")
-    assert again.fit.theta.tolist() == found.fit.theta.tolist()
-    assert list(again.records[0].held) == ["u1", "u2"]
-    band, stored = (each.of_input("u2").step_response([1.0, 5.0]) for each in (found, again))
-    np.testing.assert_array_equal(band.lower, stored.lower)
-    assert {item.name for item in found.derived} >= {"u1_static_gain", "u2_time_constant_1"}
-    with pytest.raises(UsageError, match="take one of them"):
-        found.step_response()
 
 
 @pytest.mark.parametrize(

@@ -391,15 +391,3 @@ def test_a_full_disk_loses_nothing_that_was_reported(tmp_path: Path, undisturbed
     assert group_is_gone(process, within=5)
     run(run_toys.plan(), place)
     assert exported(place) == undisturbed
-
-
-def test_preview_counts_without_writing(tmp_path: Path) -> None:
-    place = tmp_path / "toys"
-    first = preview(toy_plan(), place)
-    assert (first.data_sets, first.estimates, first.reused) == (12, 36, 0)
-    assert not place.exists()
-    run(toy_plan(runs=2), place)
-    before = snapshot(place)
-    second = preview(toy_plan(), place)
-    assert (second.data_sets, second.estimates, second.reused) == (8, 24, 12)
-    assert snapshot(place) == before
