@@ -89,20 +89,6 @@ def test_fit_is_where_scipy_ends(model, lowpass):
     assert step == pytest.approx(joint[-1], rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("model", "regular", "tolerance"),
-    [(CASE_1, True, 1e-5), (CASE_1, False, 3e-4), (CASE_2, True, 1e-5), (CASE_2, False, 1e-3)],
-)
-def test_noise_free_records_give_the_true_model(model, regular, tolerance):
-    n = 4500 if model is CASE_2 and not regular else None
-    data = spectral_data(make_record(model, regular=regular, n=n), HIGHEST[model], 8.0)
-    theta, squared_error, step = fitted(data, model, disturbed(model))
-    np.testing.assert_allclose(theta, theta_of(model), rtol=tolerance)
-    assert abs(step) < 10 * tolerance
-    _, x = columns_of(data, theta, model.order)
-    assert squared_error < (10 * tolerance) ** 2 * (x @ x)
-
-
 def test_initial_state_is_projected_out():
     # A free response larger than the forced one changes neither the estimate nor the cost.
     record = make_record(CASE_1)

@@ -12,7 +12,6 @@ from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-from tests.estimation.optimum.dense import squared_error
 from tests.estimation.optimum.systems import best, random_model, record_of
 
 
@@ -63,42 +62,6 @@ def test_a_superfluous_pole_runs_to_infinity():
     assert two.poles_at_infinity == 1
     assert two.squared_error == pytest.approx(one.squared_error, rel=1e-9)
     assert two.denominator.size == 2
-
-
-def test_the_model_has_the_reported_squared_error():
-    rng = np.random.default_rng(5)
-    record = record_of(random_model(rng, 3, 2, 0.6), rng, noise=0.3, offset=2.0)
-    data = filter_data(record, 2.0)
-    options = {"delays": (0.0, 2.0), "free_response": True, "offset": True, "random_starts": 0}
-    found = best([data], 2, 1, **options)
-    # C/A of an impulse is C p/A of a step, with the immediate jump separated.
-    used = data.t[data.use]
-    free = simulate(
-        TransferFunction(np.append(found.free_responses[0], 0.0), found.denominator),
-        HeldSignal(used[:1], np.ones(1)),
-        used,
-    )
-    x = simulate(found.model, record.input, record.t)[data.use] + free + found.trends[0, 0]
-    assert float(np.sum((data.y_used - x) ** 2)) == pytest.approx(found.squared_error, rel=1e-9)
-
-
-def test_a_periodic_record_is_exact_for_a_lightly_damped_model():
-    # The free response with a damping of .002 lasts many periods.
-    rng = np.random.default_rng(7)
-    model = TransferFunction([0.6], [1.0, 2 * 0.002 * 0.8, 0.64], 0.7)
-    t = 0.5 * np.arange(120)
-    u = rng.choice([-1.0, 1.0], t.size)
-    period, periods = 0.5 * t.size, 200
-    long = 0.5 * np.arange(periods * t.size)
-    x = simulate(model, HeldSignal(long, np.tile(u, periods)), long)[-t.size :]
-    record = Record.from_arrays(t, u, x + 0.01 * rng.standard_normal(t.size))
-    options = {"delays": (0.0, 2.0), "periods": (period,), "random_starts": 5}
-    found = best([filter_data(record)], 2, 0, **options)
-    assert found.ending is Ending.CONVERGED
-    np.testing.assert_allclose(found.denominator, model.denominator, rtol=0.01, atol=1e-4)
-    assert found.delay == pytest.approx(0.7, abs=0.02)
-    dense = squared_error(record, found.denominator, 0, found.delay, period=period)
-    assert found.squared_error == pytest.approx(dense, rel=1e-8)
 
 
 def test_an_integrating_drive_at_rest_is_next_to_the_set():

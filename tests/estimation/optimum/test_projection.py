@@ -118,20 +118,6 @@ def test_records_share_the_numerator_and_have_their_own_state_and_offset(free_re
     assert found_slopes.gradient[-1] == pytest.approx((ends[1] - ends[0]) / 4e-5, rel=1e-6)
 
 
-def test_double_poles_are_no_special_case():
-    # Two real sections coincide, and a section passes a damping of 1.
-    record = record_of(MODEL, np.random.default_rng(6), noise=0.1)
-    problem = problem_of(record, 2)
-    apart = project(problem, np.array([2.0, 2.0, 0.5]), -np.ones(3), Delay(0.0, -1)).squared_error
-    together = project(problem, np.array([2.0, 0.5]), np.array([1.0, -1.0]), Delay(0.0, -1)).squared_error
-    assert together == pytest.approx(apart, rel=1e-10)
-    below, above = (
-        project(problem, np.array([2.0, 0.5]), np.array([1.0 + d, -1.0]), Delay(0.0, -1)).squared_error
-        for d in (-1e-6, 1e-6)
-    )
-    assert below + above == pytest.approx(2 * together, rel=1e-10)
-
-
 @pytest.mark.parametrize("length", [100.0, 1e-6])
 def test_states_and_slopes_have_the_transfer_functions_that_they_claim(length):
     # All responses overlap in a very short record.
