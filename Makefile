@@ -20,7 +20,8 @@ VERSIONS ?= pinned
 
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# Python compiles what it imports; all modules of all dependencies take pip most of a minute.
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
 .PHONY: demo test types pytest reproduce reproduce-small docs scoreboard release-check bench clean
 .DELETE_ON_ERROR:

@@ -11,6 +11,7 @@ from ctid_cli import (
     HeldSignal,
     Record,
     TransferFunction,
+    estimate_frequency_response,
     identify_frequency_response,
     simulate,
 )
@@ -129,6 +130,15 @@ def test_weights_do_not_matter_to_values_without_errors(weight):
     data = FrequencyData(LINES, 1e-3 * SECOND.frequency_response(LINES), weight=weight)
     fit = FrequencyDomain(2, 1, fixed=(Fixed("a1", 1.0),)).fit(data)
     np.testing.assert_allclose(fit.theta, [1.0, 4.0, 2e-3, 4e-3], rtol=1e-9)
+
+
+def test_an_estimated_response_gives_the_system_although_its_hold_was_divided_out():
+    u = np.tile(np.random.default_rng(3).standard_normal(300), 8)
+    t = 0.2 * np.arange(u.size)
+    y = simulate(SECOND, HeldSignal(t, u), t) + 1e-6 * np.random.default_rng(4).standard_normal(u.size)
+    found = estimate_frequency_response(Record(t, y, HeldSignal(t, u)))
+    fit = FrequencyDomain(2, 1).fit(found.data)
+    np.testing.assert_allclose(fit.theta, [1.0, 4.0, 2.0, 4.0], rtol=1e-5)
 
 
 def test_noise_alone_is_no_model():
