@@ -20,7 +20,7 @@ VERSIONS ?= pinned
 
 VENV := .venv
 BIN := $(VENV)/bin
-# Python compiles what it imports; all modules of all dependencies take pip most of a minute.
+# Python compiles what it imports; pip would compile every module of every dependency, one after the other.
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
 .PHONY: demo test types pytest reproduce reproduce-small docs scoreboard release-check bench clean
