@@ -36,6 +36,12 @@ def test_a_frequency_response_is_fitted_drawn_and_reported(ctid, tmp_path, snaps
     assert pages[0] == pages[1]
 
 
+def test_a_delay_that_is_missing_is_named(ctid, tmp_path):
+    response_file(tmp_path)
+    found = ctid("fit --poles 1 --json --out", tmp_path / "new", tmp_path / "frf.csv").stdout
+    assert json.loads(found)["warnings"][0].startswith("The delay is taken as 0 s: with --delay 0:16 the fit is 9")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [("--input u", "several inputs are fitted from records"), ("--weight inverse", "drop --weight")],

@@ -11,7 +11,11 @@ from ctid_cli import DelayProfile, HeldSignal, Record, Rivc, TransferFunction, i
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.inference.covariance import condition_number
 from ctid_cli.inference.fit import Status
+from ctid_cli.inference.sensitivities import sensitivities
+from ctid_cli.running.plan import build_plan
+from ctid_cli.running.theory import least_variances
 from ctid_cli.signals.noise import ArmaNoise
+from ctid_cli.specification.load import load_spec
 
 SYSTEM = TransferFunction([4.0], [1.0, 2.8, 4.0], 0.537)
 KNOWN = {"poles": 2, "zeros": 0, "delay_bounds": (0.537, 0.537)}
@@ -117,6 +121,36 @@ def test_a_larger_plant_is_no_less_likely():
     fits = [DelayProfile(n, m, (0.0, 2.0), nested=True, **options).fit(record) for n, m in ((1, 0), (2, 0), (2, 1))]
     deviances = [fit.noise.deviance for fit in fits]
     assert deviances[0] + 1e-4 > deviances[1] > deviances[2] - 1e-4
+
+
+EXPERIMENT = """
+experiment: noise
+system:     {numerator: [4], denominator: [1, 2.8, 4], delay: 0.537}
+excitation: {kind: prbs, stages: 6, clock_period: 0.3, amplitude: 1.0}
+sampling:   {kind: regular, interval: 0.1, samples: 200}
+noise:      {kind: arma, numerator: [1, 0.2679], denominator: [1, -1.98, 0.9802], innovation_variance: 1.0e-6}
+estimators:
+  one: {kind: rivc, poles: 2, zeros: 0, delay_bounds: [0, 2], noise_model: "arma:2,1"}
+monte_carlo: {runs: 1, seed: 1}
+"""
+
+
+def test_rivc_in_an_experiment_has_the_bound_of_its_noise(tmp_path):
+    """Bound by the dense covariance matrix, averaged over the data sets used by the theory."""
+    (tmp_path / "noise.yaml").write_text(EXPERIMENT, encoding="utf-8")
+    plan = build_plan(load_spec(tmp_path / "noise.yaml"))
+    (cell,), (part,) = plan.data_cells, plan.estimators
+    records = [cell.source.dataset(k).record for k in range(10)]
+    assert type(part.estimator) is Rivc
+    assert part.estimator.fit(records[0]).noise.orders == (2, 1)
+    law, bounds = ArmaNoise(*SLOW, innovation_variance=1e-6), []
+    for record in records:
+        psi = sensitivities(SYSTEM, record.input, record.t, estimate_delay=True)[record.t >= 2.0 - 1e-9]
+        inner = psi.T @ np.linalg.solve(toeplitz(law.autocovariance(np.arange(len(psi)))), psi)
+        bounds.append(np.diag(np.linalg.inv(inner)))
+    least = least_variances(plan, 0, 0)
+    found = [least[name] for name in ("a1", "a2", "b0", "delay")]
+    np.testing.assert_allclose(found, np.mean(bounds, axis=0), rtol=1e-6)
 
 
 def test_a_plant_of_too_few_poles_is_detected():
