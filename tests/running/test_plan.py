@@ -83,18 +83,6 @@ def test_tasks_and_keys(plan_of):
     ]
 
 
-def test_columns_of_swept_fields(plan_of):
-    plan = plan_of("system.delay=[1,2]", "estimators.known.delay=[1,2]", "sampling.low=[0.05,0.06]")
-    assert set(plan.data_cells[0].swept) == {"system.delay", "sampling.low", "snr_db"}
-    assert plan.estimators[1].swept == {"estimator.delay": 1.0}, "delay is the estimated one"
-    nested = plan_of(
-        "estimators.search.lowpass={cutoff: [0.5, 1], order: 2}", "excitation={kind: gaussian, clock_period: [0.5, 1]}"
-    )
-    assert nested.estimators[0].swept == {"cutoff": 0.5}
-    assert nested.estimators[1].estimator.lowpass.cutoff == 1.0
-    assert nested.data_cells[0].swept == {"clock_period": 0.5, "snr_db": 5.0}
-
-
 @pytest.mark.parametrize(
     "override",
     [

@@ -1,7 +1,5 @@
 """Experiments with several inputs: sum of single-input data sets, and estimates under the names of all inputs."""
 
-from copy import deepcopy
-
 import numpy as np
 import pytest
 
@@ -64,14 +62,6 @@ def test_outputs_add_up_and_inputs_have_random_numbers_of_their_own():
     parts = data.true_model.parts
     assert list(parts) == ["u1", "u2"]
     assert (parts["u2"].delay, data.true_model.common) == (0.5, False)
-
-
-def test_swept_values_of_an_input_make_data_cells():
-    several = deepcopy(spec())
-    several["inputs"]["u2"]["system"]["delay"] = [0.4, 0.5]
-    cells = build_plan(load_spec(several)).data_cells
-    assert [cell.swept for cell in cells] == [{"inputs.u2.system.delay": 0.4}, {"inputs.u2.system.delay": 0.5}]
-    assert [cell.dataset(0).true_model.parts["u2"].delay for cell in cells] == [0.4, 0.5]
 
 
 @pytest.mark.parametrize(

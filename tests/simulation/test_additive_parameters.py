@@ -107,11 +107,3 @@ def test_a_sum_of_submodels_is_what_it_is():
 def test_fractions_that_have_no_such_submodels(denominator, terms):
     fit = FractionFit(TransferFunction([1.0], denominator), ("a1", "a2", "b0"), np.eye(3))
     assert additive_parameters(fit, terms) == (None, {}, {})
-
-
-def test_real_poles_are_neighbours_in_a_submodel_of_the_second_order():
-    poles = TransferFunction([1.0], np.poly([-1.0, -2.0, -30.0, -40.0]))
-    fit = FractionFit(poles, ("a1", "a2", "a3", "a4", "b0"), np.eye(5))
-    parameters, *_ = additive_parameters(fit, TERMS)
-    assert parameters["g1_a2"] == pytest.approx(1 / 2)
-    assert parameters["g2_a2"] == pytest.approx(1 / 1200)

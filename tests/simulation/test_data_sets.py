@@ -120,14 +120,3 @@ def test_a_record_that_changed_since_is_refused(file):
     # Its results can still be read.
     assert build_plan(spec_from_canonical(plan.spec.canonical())).data_cells[0].hash == plan.data_cells[0].hash
     assert plan_of(spec=measured(file)).data_cells[0].hash != plan.data_cells[0].hash
-
-
-def test_an_input_from_a_file(file):
-    overrides = [
-        f"excitation={{kind: file, file: {file}, hold: foh}}",
-        "sampling={kind: regular, interval: 0.1, samples: 99}",
-        "system.delay=0.5",
-    ]
-    record = record_of(*overrides)
-    np.testing.assert_allclose(record.input.values, read_record(file).input.values[:99])
-    assert record.input.hold == "foh", "samples of straight lines are joined by straight lines"
