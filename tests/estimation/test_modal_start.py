@@ -5,7 +5,6 @@ import pytest
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Start
-from ctid_cli.estimation.modal_start import _pole_sets
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.signals.record import Record
@@ -82,15 +81,6 @@ def test_every_structure(others, mode_first):
     assert start.model.terms == system.terms
     assert start.model.is_marginally_stable
     np.testing.assert_allclose(start.model.theta, system.theta, rtol=0.05, atol=1e-3)
-
-
-def test_either_set_of_poles_would_do():
-    problem = AdditiveSrivc(terms=TWO_MODES.terms).prepare(open_record(TWO_MODES, 1500, 0.1, 3)).laid_out.problem
-    sets = _pole_sets(problem, problem.data)
-    assert len(sets) == 2
-    for _, poles in sets:
-        frequencies = sorted(np.abs(poles))
-        np.testing.assert_allclose(frequencies, [part.natural_frequency for part in TWO_MODES.submodels], rtol=0.05)
 
 
 def test_irregular_clock():

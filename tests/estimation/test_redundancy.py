@@ -3,7 +3,6 @@
 import math
 from itertools import pairwise
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -89,16 +88,6 @@ def test_the_reference_cost_is_evaluated_once_for_each_visit():
     found = minimise_redundantly(9.0, reference, [to(5.0, 4.0), to(), to(3.0)], choice="best")
     assert asked == [visit.point for visit in found.visits] == [9.0, 5.0, 4.0, 3.0, 5.0, 4.0, 3.0]
     assert [visit.accepted for visit in found.visits] == [True, False, False, True, False, False, False]
-
-
-def test_arrays_are_points():
-    # Two valleys: each path moves along one coordinate only, so neither reaches the minimum alone.
-    target = np.array([1.0, -2.0])
-    paths = [lambda x: [np.array([target[0], x[1]])], lambda x: [np.array([x[0], target[1]])]]
-    found = minimise_redundantly(np.zeros(2), lambda x: float(np.sum((x - target) ** 2)), paths)
-    np.testing.assert_array_equal(found.point, target)
-    assert [visit.path for visit in found.trajectory] == [-1, 0, 1]
-    assert found.switches == (found.trajectory[-1],)
 
 
 @pytest.mark.parametrize(
