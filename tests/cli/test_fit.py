@@ -91,17 +91,6 @@ def test_several_files_and_a_validation_record(ctid, record, tmp_path):
     assert content["validation"]["r2"] > 0.99
 
 
-def test_microseconds(ctid, record, tmp_path):
-    values = rows()
-    values[:, 0] *= 1e6
-    scaled = write(tmp_path / "scaled.csv", values, "t [us],u,y")
-    base = json.loads(ctid("fit", record, "--poles", 2, "--delay", "0:3", "--json", "--out", tmp_path).stdout)
-    other = json.loads(ctid("fit", scaled, "--poles", 2, "--delay", "0:3e6", "--json", "--out", tmp_path).stdout)
-    assert other["model"]["delay"] == pytest.approx(1e6 * base["model"]["delay"], rel=1e-8)
-    assert other["modes"] == [pytest.approx(mode, rel=1e-7) for mode in base["modes"]]
-    assert other["parameters"][-1]["unit"] == "us"
-
-
 @pytest.mark.parametrize("text", ["3:0", "-1:2", "nan", "0:inf", "0:1:2"])
 def test_a_range_of_delays_is_low_high_and_not_negative(text):
     with pytest.raises(typer.BadParameter, match="must be LOW:HIGH"):

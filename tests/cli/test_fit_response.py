@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ctid_cli import HeldSignal, TransferFunction, simulate
 from tests.cli.records import write
 
 RESPONSE = np.geomspace(0.1, 20.0, 60)
@@ -35,17 +34,6 @@ def test_a_frequency_response_is_fitted_drawn_and_reported(ctid, tmp_path, snaps
     ctid("report new/fit.json --file again.html")
     pages = [(tmp_path / name).read_text() for name in ("new/fit.html", "again.html")]
     assert pages[0] == pages[1]
-
-
-def test_what_frf_writes_is_fitted_with_the_hold_that_it_took_out(ctid, tmp_path):
-    u = np.tile(np.random.default_rng(0).standard_normal(100), 20)
-    t = 0.5 * np.arange(u.size)
-    y = simulate(TransferFunction([2.0], [1.0, 1.0]), HeldSignal(t, u), t)
-    write(tmp_path / "record.csv", (t, u, y + 1e-5 * np.random.default_rng(1).standard_normal(t.size)), "t,u,y")
-    ctid("frf --out", tmp_path, tmp_path / "record.csv")
-    content = json.loads(ctid("fit --poles 1 --json --out", tmp_path, tmp_path / "frf.csv").stdout)
-    assert content["frequency_response"]["interval"] == 0.5
-    assert [item["estimate"] for item in content["parameters"][:2]] == pytest.approx([2.0, 1.0], rel=1e-4)
 
 
 def test_a_delay_that_is_missing_is_named(ctid, tmp_path):

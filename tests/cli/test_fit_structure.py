@@ -12,7 +12,6 @@ from tests.cli.records import LOOP, in_loop, write
 
 STEP = 0.05
 MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
-RIGID = AdditiveModel([Submodel([0.5], [1.0], 1), Submodel([2.0], [0.3, 0.2, 1.0])])
 
 
 def record(file, system, n=800, noise=0.05, seed=0):
@@ -58,42 +57,6 @@ def test_a_sum_of_submodels_is_printed_written_and_read_back(ctid, tmp_path):
     }
     assert np.mean(again.fit.residuals[0] ** 2) == pytest.approx(content["cost"], rel=1e-12)
     assert again.validation.applied.residuals[0].size == 800
-
-
-def test_integrators_belong_to_the_first_submodel(ctid, tmp_path):
-    file = record(tmp_path / "rigid.csv", RIGID)
-    options = ("--model", "additive", "--terms", "0/0,2/0", "--integrators", 1, "--out", tmp_path)
-    content = fitted(ctid, file, *options)
-    near(content, {"g1_b0": 0.5, "g2_b0": 2.0, "g2_a1": 0.2, "g2_a2": 0.3})
-    assert content["parameters"][0]["unit"] == "out/in/s"
-    assert content["warnings"] == []
-    # An integrator in addition to poles needs no other options.
-    file = record(tmp_path / "one.csv", AdditiveModel([Submodel([1.0], [0.5, 1.0], 1)]))
-    content = fitted(ctid, file, "--poles", 1, "--integrators", 1, "--out", tmp_path)
-    near(content, {"a1": 2.0, "b0": 2.0})
-    assert content["modes"][-1]["damping"] is None
-
-
-def test_a_pole_next_to_the_origin_is_named_with_the_remedy_that_was_tried(ctid, tmp_path):
-    file = record(tmp_path / "drive.csv", AdditiveModel([Submodel([1.0], [0.5, 1.0], 1)]))
-    warnings = fitted(ctid, file, "--poles", 2, "--delay", "0:0.2", "--out", tmp_path)["warnings"]
-    words = "indistinguishable from an integrator: with --poles 1 --zeros 0 --integrators 1 the held-back fit is"
-    assert words in warnings[0]
-    one = fitted(ctid, file, "--poles", 1, "--out", tmp_path)["warnings"][0]
-    assert "with --integrators 1 the held-back fit is" in one
-
-
-def test_fixed_parameters_have_their_values_and_no_errors(ctid, tmp_path):
-    file = record(tmp_path / "one.csv", MODES)
-    options = ("--model", "additive", "--terms", "2/0,2/0", "--fix", "g1_a2=0.25", "--fix", "g2_b0=1")
-    content = fitted(ctid, file, *options, "--out", tmp_path)
-    found = {item["name"]: item for item in content["parameters"]}
-    for name, value in (("g1_a2", 0.25), ("g2_b0", 1.0)):
-        assert (found[name]["estimate"], found[name]["status"]) == (value, "fixed")
-        assert found[name]["standard_error"] is None
-    assert content["criteria"]["parameters"] == 4
-    plain = fitted(ctid, file, "--poles", 4, "--zeros", 2, "--fix", "a4=160", "--out", tmp_path)
-    assert plain["model"]["denominator"][-1] == 160.0
 
 
 def test_a_loop_removes_the_bias_that_coloured_noise_makes(ctid, closed, tmp_path):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ctid_cli import HeldSignal, TransferFunction, simulate
-from tests.cli.records import first_order, write
+from tests.cli.records import write
 
 
-def answered(file, gain, seed=0):
+def response_record(file, gain, seed=0):
     rng = np.random.default_rng(seed)
     t = 0.1 * np.arange(500)
     u = np.repeat(rng.choice([-1.0, 1.0], 100), 5)
@@ -19,12 +19,12 @@ def answered(file, gain, seed=0):
 
 @pytest.fixture
 def record(tmp_path):
-    return answered(tmp_path / "record.csv", 1.0)
+    return response_record(tmp_path / "record.csv", 1.0)
 
 
 def test_table_and_files(ctid, record, tmp_path, monkeypatch, snapshot):
     monkeypatch.chdir(tmp_path)
-    answered(tmp_path / "other.csv", 1.0, 1)
+    response_record(tmp_path / "other.csv", 1.0, 1)
     options = ("--poles", "1:2", "--zeros", "0:1", "--validate", "other.csv", "--out", "new")
     assert ctid("order", "record.csv", *options).stdout == snapshot
     content = json.loads((tmp_path / "new" / "order.json").read_text(encoding="utf-8"))
@@ -49,18 +49,3 @@ def test_sums_of_submodels(ctid, tmp_path, snapshot, monkeypatch):
     typed = json.loads(ctid("fit", "modes.csv", *content["command"], "--json").stdout)
     chosen = json.loads(ctid("fit", "modes.csv", "--model", "additive", "--json").stdout)
     assert typed["parameters"] == chosen["parameters"]
-
-
-def test_noise_has_no_order(ctid, tmp_path):
-    record = answered(tmp_path / "noise.csv", 0.0)
-    done = ctid("order", record, "--poles", "1:2", "--zeros", "0", "--delay", "0:1", "--json", "--out", tmp_path)
-    content = json.loads(done.stdout)
-    assert content["recommended"] is None
-    assert content["reason"].startswith("There is no model here")
-
-
-def test_a_record_too_short_for_some_structures(ctid, tmp_path):
-    record = write(tmp_path / "short.csv", first_order(n=24), "t [s],u [V],y [mm]")
-    content = json.loads(ctid("order", record, "--json", "--out", tmp_path).stdout)
-    endings = {"CONVERGED", "AT_BOUND", "RIDGE", "DELAY_AT_BOUND", "STALLED"}
-    assert {each["status"] for each in content["orders"]} <= endings

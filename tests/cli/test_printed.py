@@ -76,23 +76,3 @@ def test_a_table_counts_the_estimates_that_meet_the_rule(ctid, home, name, keys)
         mine = [each for each in estimates if [each["estimator"], *map(each.get, keys)] == cell]
         assert (row["n"], row["converged"]) == (len(mine), sum(each["converged"] for each in mine))
         assert row["percent"] == 100 * row["converged"] / row["n"]
-
-
-def test_the_rule_of_success(ctid, home):
-    for each in json.loads(ctid("export tiny --json").stdout):
-        assert each["converged"] == (abs(each["delay"] - 0.35) <= 0.2 * 0.35)
-    truth = {"g1_a1": 0.25, "g1_a2": 0.25, "g1_b0": 3.0, "g2_a1": 0.01, "g2_a2": 0.025, "g2_b0": 1.0}
-    for each in json.loads(ctid("export loop --json").stdout):
-        # By natural frequency, although the faster one is first in the specification.
-        errors = [abs(each["parameters"][name] / true - 1) for name, true in truth.items()]
-        assert each["converged"] == (max(errors) <= 0.2)
-    settling = ("settling_time_1", "settling_time_2", "settling_after_step_1", "settling_after_step_2")
-    for each in json.loads(ctid("export beat --json").stdout):
-        times = [each["measures"].get(name) for name in settling]
-        assert each["estimator"] == "whole" or each["converged"] == all(t is not None and t <= 8 for t in times)
-
-
-def test_a_measured_record(ctid, home):
-    for row in json.loads(ctid("table measured-tiny --json").stdout):
-        # y' = -2 y + 2 u
-        assert row["denominator"] == pytest.approx([1, 2], rel=0.05)

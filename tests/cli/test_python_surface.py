@@ -17,7 +17,6 @@ from ctid_cli import (
     FrequencyTrack,
     Given,
     Record,
-    SpecError,
     Srivc,
     TransferFunction,
     identify,
@@ -71,15 +70,6 @@ def test_results_are_those_of_the_commands(out, ctid, tmp_path):
     # A mapping and a file with equal content are one experiment.
     again = run_experiment(out / "group" / "study" / "spec.yaml", out, jobs=1)
     assert set(again.estimates["id"]) == set(results.estimates["id"])
-
-
-def test_mistakes_are_named(tmp_path):
-    with pytest.raises(SpecError, match=r"\(specification\):3:3: system.numeratr: .* did you mean 'numerator'"):
-        run_experiment(SPEC | {"system": {"numeratr": [2], "denominator": [1, 1]}}, tmp_path)
-    with pytest.raises(CtidError, match="holds texts, numbers, lists and mappings, and here is a TransferFunction"):
-        run_experiment(SPEC | {"system": TransferFunction([2], [1, 1])}, tmp_path)
-    with pytest.raises(CtidError, match="there are no results in"):
-        read_results(tmp_path)
 
 
 def test_a_fit_is_shown_as_by_the_command(ctid, tmp_path):

@@ -13,7 +13,7 @@ from tests.cli.records import tones, write
 T, Y = tones().T
 
 
-def answered(file, u, seed=0, header="t [s],u [V],y [mm]", times=None):
+def response_record(file, u, seed=0, header="t [s],u [V],y [mm]", times=None):
     """Write the response of 2 / (p + 1), with noise."""
     t = 0.1 * np.arange(u.size) if times is None else times
     y = simulate(TransferFunction([2.0], [1.0, 1.0]), HeldSignal(t, u), t)
@@ -22,7 +22,7 @@ def answered(file, u, seed=0, header="t [s],u [V],y [mm]", times=None):
 
 def test_periods_realisations_and_units(ctid, tmp_path):
     once = [np.random.default_rng(k).standard_normal(200) for k in range(3)]
-    files = [answered(tmp_path / f"{k}.csv", np.tile(u, 6), k, "t [ms],u,y") for k, u in enumerate(once)]
+    files = [response_record(tmp_path / f"{k}.csv", np.tile(u, 6), k, "t [ms],u,y") for k, u in enumerate(once)]
     content = json.loads(ctid("frf --json --out", tmp_path, files[0]).stdout)
     assert (content["method"], len(content["frequencies"]), content["distortion"]) == ("periodic", 99, None)
     assert content["units"] == {"time": "ms", "input": "in", "output": "out"}
@@ -33,7 +33,7 @@ def test_periods_realisations_and_units(ctid, tmp_path):
     assert "17 lines" in text
     assert "rad/ms" in text
     irregular = np.cumsum(np.random.default_rng(1).uniform(0.05, 0.15, 1200))
-    file = answered(tmp_path / "any.csv", np.tile(once[0], 6), times=irregular)
+    file = response_record(tmp_path / "any.csv", np.tile(once[0], 6), times=irregular)
     assert "the clock is irregular" in ctid("frf --out", tmp_path, file).stdout
 
 

@@ -12,7 +12,6 @@ import yaml
 from ctid_cli.cli import reproduce_command
 from ctid_cli.cli.experiment_commands import SpecOptions
 from ctid_cli.cli.reproduce_command import PublishedSpecs
-from ctid_cli.reporting.comparison_result import check_tables
 from ctid_cli.reporting.study import find_study
 from ctid_cli.studies import first_estimates, publishing
 from ctid_cli.studies.catalogue import read_study
@@ -38,7 +37,7 @@ def test_run_runs_the_specifications_of_what_is_named(ctid, tmp_path, monkeypatc
     assert {(call["runs"], call["jobs"], call["place"].out) for call in calls} == {(3, 1, tmp_path)}
 
 
-def test_what_is_unwise_in_published_specifications_is_not_said_to_who_reproduces_them(capsys):
+def test_warnings_about_published_specifications_are_not_printed(capsys):
     for specs, said in ((SpecOptions(), "warning: "), (PublishedSpecs(), "")):
         specs.plans([CONFIGS / "case1_irregular.yaml"])
         assert capsys.readouterr().err[:9] == said
@@ -61,29 +60,6 @@ def profiled(tmp_path_factory, ctid, without_workers):
     (folder / "case1_regular.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
     ctid("run --quiet --out", folder / "results", folder / "case1_regular.yaml")
     return folder / "results"
-
-
-@pytest.mark.parametrize(("case", "tables"), [("case1_regular", "1 2"), ("case2_irregular", "3 4")])
-@pytest.mark.usefixtures("without_workers")
-def test_one_data_set_fills_its_cells(ctid, tmp_path, case, tables):
-    plan = find_study("useful-redundancy").plan(case.replace("_", "-"))
-    overrides = ("--set", "noise.snr_db=15", "--set", "starts.initial_delay=[0, {uniform: [0, 9]}]")
-    ctid("run --runs 1 --quiet --out", tmp_path, CONFIGS / f"{case}.yaml", *overrides)
-    rows = json.loads(ctid(f"table {tables} --json --out", tmp_path).stdout)
-    starts = {cell.name: cell.estimator.start_from == "delay" for cell in plan.estimators}
-    methods = sorted(starts, key=list(find_study().methods).index)
-    mine = [row for row in rows if row["sampling"] == case.partition("_")[2] and row["n"]]
-    assert [(row["table"], row["snr_db"], row["initial_delay"], row["method"]) for row in mine] == [
-        (int(table), 15, delay if starts[method] else None, method)
-        for table, delay in zip(tables.split(), (0, "random"), strict=True)
-        for method in methods
-    ]
-    for row in mine:
-        # The existing method succeeds from some starts, the others from all.
-        assert row["percent"] == 100 or row["method"] == "existing"
-        assert (row["published_percent"] is not None) == (row["method"] in ("existing", "redundancy"))
-    # The results agree with the committed tables and the paper.
-    assert check_tables(tables.split(), tmp_path).mismatches.empty
 
 
 def test_a_method_without_a_start_stands_in_both_tables_with_the_same_numbers(ctid, profiled, tmp_path, monkeypatch):

@@ -1,6 +1,5 @@
 """``ctid run``: messages, exit, resuming, shards, and allowed places of files."""
 
-import contextlib
 import json
 import os
 import re
@@ -35,7 +34,7 @@ def untimed(text):
 
 
 @pytest.mark.usefixtures("without_workers")
-def test_what_is_said_of_a_run_of_another_one_and_of_none(ctid, here, snapshot):
+def test_messages_of_runs(ctid, here, snapshot):
     said = [
         ctid("run tiny.yaml --runs 1 --set noise.snr_db=20"),
         ctid("run tiny.yaml --runs 1 --set noise.snr_db=20"),
@@ -61,19 +60,6 @@ def test_a_run_until_it_is_precise_says_how_far_it_is(ctid, here, snapshot, monk
     # A number on the command line overrides the rule in the file.
     assert "6 of 6 estimates stored" in ctid("run tiny.yaml --runs 1").stdout
     assert "precision" not in json.loads(ctid("status tiny --json").stdout)
-
-
-@pytest.mark.usefixtures("without_workers")
-def test_estimates_depend_on_content_alone(ctid, used, here):
-    """Results do not depend on the folder or an earlier number of runs; the record is found from another folder."""
-    ctid("run tiny.yaml --runs 1 --quiet")
-    ctid("run tiny.yaml --quiet")
-    (here / "elsewhere").mkdir()
-    with contextlib.chdir("elsewhere"):
-        ctid("run ../measured-tiny.yaml --quiet --out ../results")
-    for name in ("tiny", "measured-tiny"):
-        first, again = (json.loads(ctid(f"export {name} --json --out", out / "results").stdout) for out in (used, here))
-        assert [(row["id"], row["numerator"]) for row in again] == [(row["id"], row["numerator"]) for row in first]
 
 
 def test_an_experiment_that_fails_wholly_does_not_stop_the_next_one(ctid, here, monkeypatch, snapshot):

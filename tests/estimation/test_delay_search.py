@@ -96,17 +96,6 @@ def test_search_asks_for_the_delays_of_its_steps(cost, start, options, asked, ou
     assert found.path[:, -1].tolist() == [cost.cost(delay) for delay in found.path[:, 1]]
 
 
-def test_coefficients_are_handed_on():
-    cost = quadratic(3.0)
-    search(cost, 7.0, largest_step=2.0)
-    # Each trial starts from the coefficients of the last accepted delay.
-    assert cost.starts == [([[3.0, 4.0]], False), ([[17.0, 7.0]], False), ([[5.0, 5.0]], False)]
-    # Without coefficients, the cost uses its default start.
-    cost = quadratic(3.0)
-    search(cost, 7.0, START[:0])
-    assert cost.starts[0] == ([], True)
-
-
 @given(st.floats(0, 10), st.floats(-30, 40), st.floats(0.1, 3), st.floats(0.05, 10), st.booleans())
 def test_never_leaves_the_bounds_nor_rises(start, at, gain, largest_step, reflect):
     # For any place of the minimum and any step gain.

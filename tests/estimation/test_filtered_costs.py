@@ -89,20 +89,6 @@ def test_fit_is_where_scipy_ends(model, lowpass):
     assert step == pytest.approx(joint[-1], rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("model", "regular", "tolerance"),
-    [(CASE_1, True, 1e-5), (CASE_1, False, 3e-4), (CASE_2, True, 1e-5), (CASE_2, False, 1e-3)],
-)
-def test_noise_free_records_give_the_true_model(model, regular, tolerance):
-    n = 4500 if model is CASE_2 and not regular else None
-    data = spectral_data(make_record(model, regular=regular, n=n), HIGHEST[model], 8.0)
-    theta, squared_error, step = fitted(data, model, disturbed(model))
-    np.testing.assert_allclose(theta, theta_of(model), rtol=tolerance)
-    assert abs(step) < 10 * tolerance
-    _, x = columns_of(data, theta, model.order)
-    assert squared_error < (10 * tolerance) ** 2 * (x @ x)
-
-
 def test_initial_state_is_projected_out():
     # A free response larger than the forced one changes neither the estimate nor the cost.
     record = make_record(CASE_1)
@@ -197,16 +183,6 @@ def test_unstable_own_starts_are_reflected():
         record, [Lowpass(7.0, 10)], Structure(1, 0), 0.5, start=0.5, svf_cutoffs=cutoffs, steps=steps
     )
     assert costs[0].minimise(0.25, np.empty((0, 3)), True).theta[0] == pytest.approx(0.5, rel=1e-2)
-
-
-def test_minimum_is_the_best_of_its_starts():
-    cost = costs_of(make_record(snr_db=15, n=2000))[2]
-    starts = np.column_stack((theta_of(CASE_1) * np.array([[1.0], [1e-3]]), np.zeros(2)))
-    alone = [cost.minimise(7.7, start[None], False).squared_error for start in starts]
-    least_squares = cost.minimise(7.7, NONE, True).squared_error
-    assert cost.minimise(7.7, starts, False).squared_error == min(alone)
-    assert cost.minimise(7.7, starts, True).squared_error == min(*alone, least_squares)
-    assert cost.minimise(7.7, NONE, False).squared_error == np.inf
 
 
 def test_costs_behind_all_filters_are_handed_down_and_up():

@@ -13,7 +13,6 @@ from ctid_cli.estimation.iteration import (
     Steps,
     inadmissible,
     iterate,
-    relative_change,
     solve_scaled,
 )
 from ctid_cli.estimation.sampled_problem import at_known_delay
@@ -86,13 +85,6 @@ def test_guarded_iteration_never_raises_the_cost():
         assert np.diff(guarded).max() <= 1e-12 * guarded[0]
         rises.append(np.diff(plain).max() / plain[-1])
     assert max(rises) > 1.0
-
-
-def test_step_of_convergence_is_free_of_units():
-    # The relative change of the output caused by a step: here 1 % more gain.
-    problem, theta = problem_of(CASE_1)
-    step = np.array([0.0, 0.0, 0.01 * theta[2], 0.0])
-    assert relative_change(problem.equations(theta), step) == pytest.approx(0.01)
 
 
 # One parameter ------------------------------------------------------------------------------------------------
@@ -217,14 +209,6 @@ def test_relaxed_steps_end_a_cycle_that_full_steps_never_leave(factor):
     fractions = np.repeat(RELAXATIONS if factor == -3.0 else RELAXATIONS[:2], PATIENCE)
     ratios = seen[1 : fractions.size + 1] / seen[: fractions.size]
     np.testing.assert_allclose(ratios, 1.0 + factor * fractions)
-
-
-def test_cycle_that_is_entered_from_within_is_left_by_the_first_relaxation():
-    # From near the solution, which full steps leave: earlier short steps have no effect later.
-    seen, result = path(Scalar(lambda theta: -2.7 * np.tanh(theta)), 0.01, "relaxed", max_iterations=500)
-    assert result.status is Status.CONVERGED
-    assert np.abs(seen).max() > 0.5
-    assert seen[-1] / seen[-2] == pytest.approx(1.0 - 0.7 * 2.7, rel=1e-6)
 
 
 def test_relaxed_steps_into_the_void_are_halved_and_the_cost_may_rise():

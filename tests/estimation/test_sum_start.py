@@ -34,12 +34,12 @@ def assert_in_basin(record, system, **options):
     np.testing.assert_allclose(one.additive.theta, other.additive.theta, rtol=1e-3)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_four_modes_in_coloured_noise(seed):
     assert_in_basin(coloured_record(seed), FOUR_MODES)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_two_modes_in_closed_loop(seed):
     assert_in_basin(loop_record(TWO_MODES, 500, 0.1, seed), TWO_MODES, instruments="closed_loop")
 

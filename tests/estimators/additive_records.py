@@ -29,7 +29,6 @@ TWO_MODES = modes([0.25, 0.25, 3.0, 0.01, 0.025, 1.0])
 PID = DiscreteController.from_pid(0.0115, 0.00725, 0.00454)
 #: The modes of a flexible beam as printed (section 7), and the initial values of its identification.
 BEAM = modes([0.0024, 0.023, 11.81, 2.33e-5, 1.65e-4, 0.159, 8.59e-7, 1.03e-5, 3.19e-4, 7.55e-7, 3.55e-6, 1.27e-4])
-BEAM_START = modes([0.001, 0.025, 10.0, 5e-5, 1.5e-4, 0.2, 8.5e-7, 2e-5, 0.001, 7.5e-7, 5e-6, 0.01])
 
 
 def open_record(system, n, noise, seed, *, interval=INTERVAL, hold="zoh", times=None):

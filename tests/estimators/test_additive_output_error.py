@@ -10,10 +10,8 @@ from ctid_cli.estimation.common import Fixed, Start
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
 from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.identification.identify import identify
 from ctid_cli.inference.fit import Status
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
-from ctid_cli.signals.held import HeldSignal
 from tests.estimators.additive_records import MODE, TWO_MODES, open_record
 
 ONE = AdditiveModel([Submodel([1.0, 3.0], [0.25, 0.25, 1.0])], 0.13)
@@ -31,10 +29,10 @@ def with_level(record, level):
     return replace(record, y=record.y + level)
 
 
-@pytest.mark.parametrize("several", [False, True])
-@pytest.mark.parametrize("treatment", TREATMENTS.values(), ids=TREATMENTS)
-def test_a_sum_of_one_mode_is_the_transfer_function(treatment, several):
-    records = [with_level(open_record(ONE, 500, 0.1, seed), 0.5 * seed) for seed in range(1 + several)]
+@pytest.mark.parametrize("name", TREATMENTS)
+def test_a_sum_of_one_mode_is_the_transfer_function(name):
+    treatment, count = TREATMENTS[name], 2 if name == "offset" else 1
+    records = [with_level(open_record(ONE, 300, 0.1, seed), 0.5 * seed) for seed in range(count)]
     additive = AdditiveOutputError((Term(2, 1),), (0.0, 0.5), **treatment).fit(records)
     fraction = DelayProfile(2, 1, (0.0, 0.5), **treatment).fit(records)
     assert additive.cost == pytest.approx(fraction.cost, rel=1e-9)
@@ -63,13 +61,6 @@ def test_the_delay_is_searched_and_every_parameter_is_near_the_truth():
     assert fit.sampling > 1.0
 
 
-def test_records_share_the_model_and_have_their_own_offsets():
-    records = [with_level(open_record(TWO, 600, 0.1, seed), level) for seed, level in ((5, -1.0), (6, 2.0))]
-    fit = AdditiveOutputError((MODE, MODE), (0.0, 0.5), offset="estimate", initial_state="estimate").fit(records)
-    assert fit.offsets == pytest.approx((-1.0, 2.0), abs=0.03)
-    assert fit.parameters["delay"] == pytest.approx(0.13, abs=4 * fit.standard_errors["delay"])
-
-
 def test_a_known_coefficient_keeps_its_value_and_moves_the_optimum_to_where_it_is_true():
     record = open_record(TWO, 600, 0.1, 7)
     options = AdditiveOutputError((MODE, MODE), (0.0, 0.5))
@@ -85,30 +76,3 @@ def test_a_known_coefficient_keeps_its_value_and_moves_the_optimum_to_where_it_i
 def test_a_start_of_other_submodels_is_refused():
     with pytest.raises(DataError, match="the start has the submodels"):
         AdditiveOutputError((MODE,)).fit(open_record(ONE, 100, 0.1, 8), Start(model=TWO))
-
-
-def test_the_order_of_terms_is_kept_and_equal_ones_rise_in_frequency():
-    slow = AdditiveModel([Submodel([0.5], [1.0, 1.0]), *TWO.submodels], 0.0)
-    terms = (MODE, Term(1, 0), MODE)
-    fit = AdditiveOutputError(terms).fit(open_record(slow, 1000, 0.01, 9))
-    assert fit.additive.terms == terms
-    assert fit.parameters["g1_a2"] == pytest.approx(0.25, rel=0.05)
-    assert fit.parameters["g2_a1"] == pytest.approx(1.0, rel=0.3)
-
-
-def test_the_model_is_judged_on_another_record_with_its_own_offset():
-    record, other = (with_level(open_record(TWO, 600, 0.1, seed), level) for seed, level in ((10, 0.0), (11, 3.0)))
-    found = identify([record], AdditiveOutputError((MODE, MODE), (0.0, 0.5), offset="estimate"), other)
-    assert found.validation.r2 > 0.99
-    assert found.validation.applied.offsets == pytest.approx((3.0,), abs=0.03)
-    assert found.warnings == ()
-
-
-def test_an_irregular_clock_and_a_linear_input():
-    rng = np.random.default_rng(12)
-    times = np.cumsum(rng.uniform(0.02, 0.08, 600))
-    irregular = AdditiveOutputError((MODE, MODE), (0.0, 0.5)).fit(open_record(TWO, 600, 0.05, 12, times=times))
-    assert irregular.parameters["delay"] == pytest.approx(0.13, abs=0.01)
-    record = open_record(TWO, 600, 0.05, 13)
-    smooth = HeldSignal(record.t, np.convolve(record.input.values, np.ones(8), "same"), "foh")
-    assert np.isfinite(AdditiveOutputError((MODE, MODE)).fit(replace(record, inputs=smooth)).cost)

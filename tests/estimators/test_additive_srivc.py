@@ -22,14 +22,11 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from tests.estimators.additive_records import (
-    BEAM,
-    BEAM_START,
     FOUR_MODES,
     INTERVAL,
     MODE,
     TWO_MODES,
     assert_parameters,
-    beam_record,
     deviations,
     disturbed,
     loop_record,
@@ -184,18 +181,6 @@ def test_order_of_the_terms_does_not_matter():
     assert one.additive.order_of_sorting == (0, 1, 2)
 
 
-def test_missing_samples_and_irregular_clocks_only_cost_accuracy():
-    rng = np.random.default_rng(10)
-    record = open_record(TWO_MODES, 3000, 0.2, 10)
-    masked = replace(record, y=np.where(rng.random(3000) < 0.1, np.nan, record.y))
-    irregular = open_record(TWO_MODES, 2000, 0.2, 11, times=np.cumsum(rng.uniform(0.02, 0.08, 2000)))
-    assert irregular.interval is None
-    for each, covariance in ((masked, "auto"), (irregular, "white"), (irregular, "sandwich")):
-        fit = fitted(each, (TWO_MODES, 1), covariance=covariance)
-        assert (fit.status, fit.count) == (Status.CONVERGED, np.isfinite(each.y).sum())
-        assert np.abs(deviations(fit, TWO_MODES)).max() < 4
-
-
 @pytest.mark.parametrize("instruments", ["open_loop", "closed_loop"])
 @pytest.mark.parametrize("system", [DRIVE, RIGID], ids=["integrator and pole", "rigid body"])
 def test_integrators(system, instruments):
@@ -226,8 +211,7 @@ def test_record_that_starts_in_motion_is_fitted_exactly(whole, system, instrumen
     assert np.abs(at_rest.additive.theta / system.sorted().theta - 1).max() > 1e-3
 
 
-@pytest.mark.parametrize("coloured", [False, True])
-def test_standard_errors_are_those_of_repeated_experiments(coloured):
+def test_standard_errors_are_those_of_repeated_experiments():
     # The ratio of 100 observed to stated standard deviations lies within 0.72 and 1.28 with 99.99 % confidence; the
     # covariance that ignores the colour of the noise is outside.
     system = modes([0.25, 0.25, 3.0, 0.02, 0.025, 1.0])
@@ -236,40 +220,14 @@ def test_standard_errors_are_those_of_repeated_experiments(coloured):
     u = HeldSignal(t, np.random.default_rng(20).standard_normal(n))
     x = simulate_additive(system, u, t)
     rng = np.random.default_rng(21)
-    estimates, stated = [], {"white": [], "sandwich": []}
-    for run in range(100):
-        e = 0.2 * rng.standard_normal(n + 200)
-        record = Record(t, x + (lfilter([1.0], [1.0, -0.9], e) if coloured else e)[200:], u)
-        for covariance, found in stated.items():
-            if covariance == "white" or run < 20:  # stated errors hardly differ from run to run
-                fit = fitted(record, system, covariance=covariance)
-                assert fit.status is Status.CONVERGED
-                found.append(np.sqrt(np.diag(fit.covariance)))
-        estimates.append(fit.additive.theta)
-    observed = np.std(estimates, axis=0, ddof=1)
-    ratios = {name: np.sqrt(np.mean(np.square(found), axis=0)) / observed for name, found in stated.items()}
-    assert ((ratios["sandwich"] > 0.72) & (ratios["sandwich"] < 1.28)).all()
-    if coloured:
-        assert (ratios["white"][:3] < 0.5).all()
-    else:
-        assert ((ratios["white"] > 0.72) & (ratios["white"] < 1.28)).all()
-
-
-def test_flexible_beam_from_rough_initial_values():
-    # Frequencies off by up to a half; the upper modes contribute 57 dB less than the first.
-    reached = 0
-    for seed in range(8):
-        record, _, sigma = beam_record(seed)
-        try:
-            fit = fitted(record, AdditiveModel(BEAM_START.submodels, 4 / 4096))
-        except DataError:  # two submodels met
-            continue
-        if fit.status is Status.CONVERGED and fit.cost < 1.2 * sigma**2:
-            reached += 1
-            frequencies = [part.natural_frequency for part in fit.additive.submodels]
-            np.testing.assert_allclose(frequencies, [p.natural_frequency for p in BEAM.submodels], rtol=1e-5)
-            assert np.abs(deviations(fit, BEAM)).max() < 5
-    assert reached >= 7
+    noises = [lfilter([1.0], [1.0, -0.9], 0.2 * rng.standard_normal(n + 200))[200:] for _ in range(100)]
+    white = [fitted(Record(t, x + noise, u), system, covariance="white") for noise in noises]
+    # Stated errors hardly differ from run to run.
+    robust = [fitted(Record(t, x + noise, u), system, covariance="sandwich") for noise in noises[:20]]
+    observed = np.std([fit.additive.theta for fit in white], axis=0, ddof=1)
+    ratio = np.sqrt(np.mean([np.diag(fit.covariance) for fit in robust], axis=0)) / observed
+    assert ((ratio > 0.72) & (ratio < 1.28)).all()
+    assert (np.sqrt(np.diag(white[0].covariance)) / observed)[:3].max() < 0.5
 
 
 def test_history_and_report_are_those_of_the_simulated_model():
@@ -290,22 +248,6 @@ def test_history_and_report_are_those_of_the_simulated_model():
     assert "given" in fit.start_method
 
 
-def test_unstable_start_is_reflected():
-    start = modes([-0.25, 0.26, 2.9, 0.0102, 0.0253, 1.05])
-    fit = fitted(open_record(TWO_MODES, 2000, 0.1, 14), start)
-    assert fit.status is Status.CONVERGED
-    assert np.abs(deviations(fit, TWO_MODES)).max() < 4
-
-
-def test_start_that_loses_a_pole_ends_in_words():
-    # Whatever happens during the iteration, a fit ends with a status or an error message.
-    for theta in ([1e-5, 1e-12, 1.0, 0.01, 0.025, 1.0], [50.0, 900.0, 1.0, 0.01, 0.0251, 1.0], [9.0, 1e-9, 0, 1, 1, 0]):
-        for variant in ("plain", "relaxed", "guarded"):
-            fit = fitted(open_record(TWO_MODES, 400, 1.0, 15), modes(theta), variant=variant)
-            assert isinstance(fit.status, Status)
-            assert fit.covariance.shape == (6, 6)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -314,14 +256,9 @@ def test_start_that_loses_a_pole_ends_in_words():
         ({"terms": (Term(2, 2), Term(1, 1))}, "as many zeros as poles in one submodel only"),
         ({"terms": (Term(0, 0), Term(0, 1, 1))}, "as many zeros as poles in one submodel only"),
         ({"terms": (Term(21, 0), Term(20, 0))}, "41 poles together; at most 40"),
-        ({"delay": -1.0}, r"delay must be zero or a positive number \[s\]"),
         ({"instruments": "closed"}, "instruments must be .*'closed_loop'.* not 'closed'"),
         ({"initial_state": "zero"}, "initial_state must be .*'estimated'.* not 'zero'"),
-        ({"covariance": "hac"}, "covariance must be .*'robust'.* not 'hac'"),
         ({"variant": "auto"}, "variant must be .*'relaxed'.* not 'auto'"),
-        ({"hold_output": "linear"}, "hold_output must be .*'foh'.* not 'linear'"),
-        ({"max_iterations": 0}, "max_iterations must be .*1.*0"),
-        ({"tolerance": 0.0}, "tolerance must lie between 0 and 1, not 0.0"),
         ({"instruments": "closed_loop", "variant": "guarded"}, "guarded is for open-loop .* use relaxed or plain"),
     ],
 )

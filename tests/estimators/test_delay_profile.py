@@ -1,7 +1,5 @@
 """Global search over the delay, and measured records: states, offsets, gaps, experiments, units."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -80,15 +78,6 @@ def test_initial_state_and_offset_of_a_noise_free_record_are_found(irregular):
     assert abs(wrong.model.dc_gain / SYSTEM.dc_gain - 1) > 0.01
 
 
-def test_removed_means_are_reported():
-    record = record_of(offset=5.0, noise=0.01, n=2000)
-    y, u = record.y, record.input.values
-    fit = DelayProfile(2, 0, (0, 3), offset="remove", initial_state="estimate").fit(record)
-    assert fit.offsets == pytest.approx([y.mean()])
-    assert fit.input_offsets == pytest.approx([u.mean()])
-    assert_same_model(fit.model, SYSTEM, 0.02)
-
-
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
 def test_a_periodic_record_is_fitted_exactly(hold):
     t = 0.1 * np.arange(2000)
@@ -110,17 +99,6 @@ def test_as_many_zeros_as_poles_with_a_known_delay():
     assert fit.parameter_names == ("a1", "a2", "b0", "b1", "b2")
     with pytest.raises(ValueError, match="zeros must be at most 1"):
         DelayProfile(2, 2, (0, 1))
-
-
-def test_masked_samples_and_gaps_do_not_bias():
-    whole = record_of(n=1500)
-    y = whole.y.copy()
-    y[::7] = np.nan
-    y[400:520] = np.nan
-    fit = DelayProfile(2, 0, (0, 3)).fit(Record(whole.t, y, whole.input))
-    assert_same_model(fit.model, SYSTEM, 1e-6)
-    np.testing.assert_array_equal(fit.used[0], np.isfinite(y))
-    assert fit.count == fit.residuals[0].size == np.isfinite(y).sum()
 
 
 # --- several experiments ---------------------------------------------------------------------------
@@ -154,32 +132,6 @@ def test_finds_the_delay_in_heavy_noise(model, regular, replicate):
     assert fit.cost <= np.mean((record.y - record.noise_free) ** 2)
 
 
-@pytest.mark.parametrize("treated", [{}, {"offset": "estimate"}])
-def test_the_profile_is_lowest_next_to_the_estimate(treated):
-    # With a filter, or on every sample if an offset is estimated.
-    fit = DelayProfile(2, 0, (0, 15), **treated).fit(make_record(snr_db=15))
-    profile = fit.profile
-    assert (profile.cutoff is None) == bool(treated)
-    spacing = np.diff(profile.delays).max()
-    assert spacing <= 0.5 * np.pi / (profile.cutoff or profile.bandwidth) * (1 + 1e-12)
-    assert abs(profile.delays[np.argmin(profile.costs)] - fit.model.delay) <= 1.5 * spacing
-
-
-def test_records_too_short_for_filters_are_searched_on_every_sample():
-    record = record_of(noise=0.02, n=23)
-    fit = DelayProfile(2, 0, (0, 1)).fit(record)
-    assert fit.profile.cutoff is None
-    assert abs(fit.model.delay - SYSTEM.delay) < 0.1
-
-
-def test_a_delay_outside_the_range_stops_at_the_bound():
-    fit = DelayProfile(2, 0, (0, 0.5)).fit(record_of(noise=0.02))
-    assert fit.status is Status.DELAY_AT_BOUND
-    assert fit.model.delay == 0.5
-    assert np.isnan(fit.standard_errors["delay"])
-    assert np.isfinite(fit.standard_errors["a1"])
-
-
 # --- a given model on other records ----------------------------------------------------------------
 
 
@@ -192,16 +144,6 @@ def test_errors_of_a_model_with_its_own_state_and_offset(initial_state):
     # On the model's own record, state and offset are already optimal.
     np.testing.assert_allclose(applied.residuals[0], fit.residuals[0], atol=1e-6)
     assert applied.offsets == pytest.approx(fit.offsets, abs=1e-6)
-
-
-def test_squared_errors_around_the_estimate():
-    options = DelayProfile(2, 0, (0, 3))
-    prepared = options.prepare(record_of(noise=0.1, offset=0.4))
-    fit = prepared.fit()
-    lowest = fit.cost * fit.count
-    assert prepared.laid_out.squared_error_at(fit.model, fit.model.delay) == pytest.approx(lowest)
-    known = replace(options, delay_bounds=(0.6, 0.6)).fit(prepared.laid_out.records)
-    assert prepared.laid_out.squared_error_at(fit.model, 0.6) == pytest.approx(known.cost * known.count, rel=1e-6)
 
 
 # --- refusals --------------------------------------------------------------------------------------

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctid_cli import HeldSignal, Record, TransferFunction, identify, load_fit, save_fit, simulate
-from ctid_cli.errors import DataError, OptionError, UsageError
+from ctid_cli import HeldSignal, Record, TransferFunction, simulate
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Fixed
 from ctid_cli.estimation.optimum.box import box_of, point_of
 from ctid_cli.estimation.optimum.projection import project, slopes
@@ -37,15 +37,14 @@ def test_a_second_numerator_fixed_at_zero_leaves_the_fit_of_the_first_input():
     assert part.delay == pytest.approx(one.model.delay, abs=1e-5)
 
 
-@pytest.mark.parametrize("state", ["rest", "estimate"])
-def test_equal_denominators_are_a_common_one(state):
+def test_equal_denominators_are_a_common_one():
     record = record_of(FIRST, TransferFunction([-1.5], [1.0, 0.6], 1.0), noise=0.2)
     known = tuple(InputModel(name, delay_bounds=(tau, tau)) for name, tau in (("u1", 0.7), ("u2", 1.0)))
-    common = DelayProfile(2, 1, (0.0, 2.0), initial_state=state, inputs=known).fit(record)
+    common = DelayProfile(2, 1, (0.0, 2.0), inputs=known).fit(record)
     values = common.model.parts["u1"].denominator[1:].tolist()
     fixed = tuple(Fixed(f"{name}_a{k}", a) for name in ("u1", "u2") for k, a in enumerate(values, 1))
     own = tuple(replace(one, poles=2) for one in known)
-    apart = DelayProfile(2, 1, (0.0, 2.0), initial_state=state, inputs=own, fixed=fixed).fit(record)
+    apart = DelayProfile(2, 1, (0.0, 2.0), inputs=own, fixed=fixed).fit(record)
     assert apart.cost == pytest.approx(common.cost, rel=1e-8)
     for name, part in common.model.parts.items():
         np.testing.assert_allclose(apart.model.parts[name].numerator, part.numerator, rtol=1e-5)
@@ -90,7 +89,7 @@ def test_gradients_of_the_projected_cost_are_exact(name, repeated):
     np.testing.assert_allclose(found, numeric, rtol=1e-5, atol=1e-6 * np.abs(found).max())
 
 
-@pytest.mark.parametrize("name", ["own", "common", "integrating"])
+@pytest.mark.parametrize("name", ["common", "integrating"])
 def test_sensitivities_are_the_derivatives_of_the_output(name):
     measured = PROBLEMS[name].prepare(record_of(FIRST, SECOND)).laid_out
     model = measured.model(measured.best((), True))
@@ -109,30 +108,6 @@ def test_sensitivities_are_the_derivatives_of_the_output(name):
         np.testing.assert_allclose(psi[:, k], slope, atol=1e-4 * np.abs(slope).max())
 
 
-def test_a_stored_fit_is_read_back_with_its_records(tmp_path):
-    record = record_of(FIRST, SECOND)
-    known = tuple(replace(one, delay_bounds=(tau, tau)) for one, tau in zip(OWN, (0.73, 1.21), strict=True))
-    found = identify(record, DelayProfile(2, 0, (0.0, 2.0), inputs=known), record)
-    save_fit(found, tmp_path / "fit.json")
-    again = load_fit(tmp_path / "fit.json")
-    assert again.fit.theta.tolist() == found.fit.theta.tolist()
-    assert list(again.records[0].held) == ["u1", "u2"]
-    band, stored = (each.of_input("u2").step_response([1.0, 5.0]) for each in (found, again))
-    np.testing.assert_array_equal(band.lower, stored.lower)
-    assert {item.name for item in found.derived} >= {"u1_static_gain", "u2_time_constant_1"}
-    with pytest.raises(UsageError, match="take one of them"):
-        found.step_response()
-
-
-def test_inputs_that_differ_in_their_hold_share_a_finer_clock():
-    record = record_of(FIRST, SECOND)
-    smooth = HeldSignal(T, np.sin(T), "band-limited")
-    mixed = replace(record, inputs={**record.held, "u2": smooth})
-    y = simulate(FIRST, record.held["u1"], T) + simulate(SECOND, smooth, T)
-    fit = DelayProfile(2, 0, (0.0, 2.0), inputs=OWN).fit(replace(mixed, y=y))
-    assert fit.model.parts["u2"].delay == pytest.approx(SECOND.delay, abs=1e-3)
-
-
 @pytest.mark.parametrize(
     ("options", "second", "message"),
     [
@@ -148,8 +123,3 @@ def test_records_and_inputs_that_do_not_go_together_are_refused(options, second,
     record = record if changed is None else replace(record, inputs={**record.held, "u2": HeldSignal(T, changed)})
     with pytest.raises((DataError, OptionError), match=message):
         DelayProfile(1, 0, (0.0, 2.0), **options).fit(record)
-
-
-def test_what_has_one_input_refuses_several():
-    with pytest.raises(DataError, match="inputs u1, u2, and this is available for one input only"):
-        record_of(FIRST, SECOND).input  # noqa: B018

@@ -143,7 +143,7 @@ def test_paths_for_simple_and_for_repeated_poles_agree_near_coalescence(partner,
 
 
 @pytest.mark.parametrize("cluster", [1e-1, 1e-3, 1e-5, 1e-7])
-def test_close_fast_poles_beside_a_slow_one_lose_no_accuracy(cluster):
+def test_close_fast_poles_and_a_slow_one_lose_no_accuracy(cluster):
     # At low frequencies the fast poles have no effect, so their cancellation must be tested at high ones.
     a = np.poly([-0.05, -100.0, -100.0 * (1 + cluster)])
     data = filter_data(record(4, n=4000, interval=0.01, hold="foh"))

@@ -10,10 +10,8 @@ from ctid_cli.models.additive import AdditiveModel, Term
 #: Degrees, then a_1 … a_n, b_0 … b_m of each submodel in turn.
 SUMS = {
     "real pole": ([Term(1, 0)], [0.7, 2.0]),
-    "mode": ([Term(2, 0)], [0.1, 0.25, 2.0]),
     "third order, biproper": ([Term(3, 3)], [0.8, 0.35, 0.1, 1.0, 0.3, -0.05, 0.2]),
     "two modes": ([Term(2, 0), Term(2, 1)], [0.1, 0.25, 2.0, 0.01, 0.05, 0.4, 0.02]),
-    "integrator": ([Term(0, 0, 1), Term(2, 0)], [0.3, 0.1, 0.25, 2.0]),
     "drive": ([Term(2, 0), Term(1, 1, 1)], [0.1, 0.25, 2.0, 0.6, 0.3, 0.1]),
     "rigid body": ([Term(2, 0), Term(0, 0, 2), Term(1, 1)], [0.1, 0.25, 2.0, 0.03, 0.7, 2.0, 0.4]),
     "three integrators": ([Term(1, 1, 3)], [0.7, 0.002, 0.001]),

@@ -51,12 +51,6 @@ def test_known_numbers():
     assert np.sum(x**2) == pytest.approx(81.84333235, rel=1e-9)
 
 
-def test_stability_of_a_known_loop():
-    assert loop_radius(TWO_MODES, PID, INTERVAL) == pytest.approx(0.9937056, abs=5e-8)
-    two, five = (DiscreteController(gain * PID.numerator, PID.denominator) for gain in (2.0, 5.0))
-    assert loop_radius(TWO_MODES, two, INTERVAL) < 1.0 < loop_radius(TWO_MODES, five, INTERVAL)
-
-
 @pytest.mark.parametrize("enters", ["controller", "input"])
 @pytest.mark.parametrize("steps", [0, 1, 4])
 @pytest.mark.parametrize("name", LOOPS)

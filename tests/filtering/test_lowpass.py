@@ -56,19 +56,6 @@ def test_irregular_records_pass_through_the_analogue_filter():
     assert np.abs(error).max() < 2e-3 * np.abs(filtered.y).max()
 
 
-@pytest.mark.parametrize("regular", [True, False])
-def test_masked_samples_stay_masked_and_the_record_unchanged(regular):
-    r = record(regular=regular)
-    y = r.y.copy()
-    y[[0, 10, 11, 999]] = np.nan
-    masked = Record(r.t, y, r.input, name="a record")
-    filtered = Lowpass(0.5).apply(masked)
-    assert np.array_equal(filtered.valid, masked.valid)
-    assert filtered.name == "a record"
-    assert np.array_equal(masked.y, y, equal_nan=True)
-    assert np.array_equal(masked.input.values, r.input.values)
-
-
 def test_cutoff_beyond_the_clock_is_refused():
     with pytest.raises(ValueError, match=r"70 rad/s is not below half the sampling frequency, 62\.83\d* rad/s"):
         Lowpass(70.0).apply(record())

@@ -19,9 +19,9 @@ from ctid_cli.inference.bounds import (
     require_uncorrelated_input,
 )
 from ctid_cli.inference.sensitivities import sensitivities
-from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
-from ctid_cli.models.factoring import factored, unfactored, unfactored_jacobian
+from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.excitation import Prbs
 from ctid_cli.signals.held import HeldSignal
@@ -181,17 +181,6 @@ def test_a_reaction_at_once_of_the_model_is_solved_for():
         limiting_accuracy(gain, INTERVAL, DiscreteController([-0.5], [1.0]), **CLOSED)
 
 
-def test_standard_errors_follow_the_unit_of_time():
-    base = limiting_accuracy(FOUR_MODES, INTERVAL, **OPEN)
-    # In another unit of time, c times the old one, a_k scales with c^-k.
-    unit = 1e-3
-    scaled = AdditiveModel(
-        [Submodel(s.numerator, s.denominator * unit ** np.arange(2, -1, -1)) for s in FOUR_MODES.submodels]
-    )
-    other = limiting_accuracy(scaled, INTERVAL * unit, **OPEN)
-    np.testing.assert_allclose(scaled.theta / other.standard_errors, base.values / base.standard_errors, rtol=1e-8)
-
-
 def test_refusals_say_why():
     with pytest.raises(DataError, match="no limit for long records"):
         limiting_accuracy(RIGID, INTERVAL, **OPEN)
@@ -219,17 +208,6 @@ def spread(size):
     return root @ root.T
 
 
-def test_names_and_values():
-    fraction = unfactored(MODEL)
-    found = ParameterAccuracy.of(fraction, spread(7), delay=True)
-    assert found.names == ("a1", "a2", "a3", "b0", "b1", "b2", "delay")
-    np.testing.assert_array_equal(found.values, [*fraction.denominator[1:], *fraction.numerator, 0.4])
-    found = ParameterAccuracy.of(TransferFunction([3.0], [1.0, 1.0, 2.0]), spread(4), zeros=1)
-    assert found.names == ("a1", "a2", "b0", "b1")
-    np.testing.assert_array_equal(found.values, [1, 2, 0, 3])
-    assert ParameterAccuracy.of(MODEL, spread(6)).names == MODEL.names
-
-
 @pytest.mark.parametrize("delay", [0, 1])
 def test_factoring_undoes_the_sum(delay):
     # The covariance of the sum's coefficients, computed from that of the submodels, is converted back.
@@ -244,16 +222,6 @@ def test_factoring_undoes_the_sum(delay):
     np.testing.assert_allclose(back.covariance, expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(back.standard_errors, np.sqrt(np.diag(expected)), rtol=1e-9)
     assert back.factored() is back
-
-
-def test_terms_choose_the_submodels():
-    model = TransferFunction([3.0, 5.0], [1.0, 3.0, 2.0])
-    accuracy = ParameterAccuracy.of(model, spread(4))
-    assert accuracy.factored().names == ("g1_a1", "g1_b0", "g2_a1", "g2_b0")
-    terms = (Term(2, 1),)
-    together = accuracy.factored(terms)
-    assert together.names == ("g1_a1", "g1_a2", "g1_b0", "g1_b1")
-    np.testing.assert_allclose(together.values, factored(model, terms).theta)
 
 
 CASE_1 = TransferFunction([2.0], [0.25, 0.7, 1.0], 8.0)

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from scipy.linalg import block_diag, toeplitz
 from scipy.signal import lfilter
 
-from ctid_cli import HeldSignal, TransferFunction, simulate
 from ctid_cli.inference.covariance import (
     condition_number,
     describe_conditioning,
@@ -35,16 +34,6 @@ def test_covariance_is_that_of_linear_least_squares(seed, exponents):
     deviations = np.sqrt(np.diag(expected))
     assert np.abs((covariance - expected) / np.outer(deviations, deviations)).max() < 1e-10
     assert np.array_equal(covariance, covariance.T)
-
-
-@given(st.integers(0, 2**31), st.floats(-8, 8))
-def test_condition_number_is_free_of_units(seed, exponent):
-    psi = sensitivities(seed, [1.0, 1.0, 1.0])
-    rescaled = psi * [1.0, 10.0**exponent, 1.0]
-    unit = psi / np.linalg.norm(psi, axis=0)
-    expected = np.linalg.cond(unit) ** 2
-    assert condition_number(psi.T @ psi) == pytest.approx(expected, rel=1e-9)
-    assert condition_number(rescaled.T @ rescaled) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -110,59 +99,6 @@ def test_white_residuals_give_the_white_formula():
     assert largest_relative_error(covariance_of([psi], [v]), expected) < 1e-12
 
 
-def test_intervals_cover_under_coloured_noise():
-    rng = np.random.default_rng(6)
-    psi = regressors(1000)
-    solve = np.linalg.pinv(psi)
-    robust, white = np.zeros(3), np.zeros(3)
-    for _ in range(200):
-        v = noise(rng, 1000)
-        error = solve @ v
-        residuals = v - psi @ error
-        robust += np.abs(error) < 1.96 * np.sqrt(np.diag(covariance_of([psi], [residuals])))
-        covariance = white_noise_covariance(psi.T @ psi, residuals @ residuals, 1000)
-        white += np.abs(error) < 1.96 * np.sqrt(np.diag(covariance))
-    # of 200 runs: two binomial standard deviations are 0.031
-    assert (robust / 200 > 0.93 - 0.031).all()
-    assert (robust / 200 < 0.97 + 0.031).all()
-    assert (white / 200 < 0.85).all()
-
-
-def test_errors_at_random_instants_of_continuous_noise():
-    # Nearly collinear sensitivities of a third-order system; the noise is that of a first-order process in time.
-    rng = np.random.default_rng(3)
-    t = np.cumsum(rng.uniform(0.05, 0.15, 800))
-    held = HeldSignal(np.arange(0.0, 90.0, 0.5), rng.choice([-1.0, 1.0], 180))
-    points = np.diag([1e-4] * 5)
-    outputs = [
-        [
-            simulate(
-                TransferFunction([6 + step[3]], [1, 4.2 + step[0], 7.4 + step[1], 6 + step[2]], 0.9 + step[4]), held, t
-            )
-            for step in (point, -point)
-        ]
-        for point in points
-    ]
-    psi = np.column_stack([after - before for after, before in outputs]) / 2e-4
-    solve = np.linalg.pinv(psi)
-    colour = 0.9 ** (np.abs(np.subtract.outer(t, t)) / 0.1)
-    root = np.linalg.cholesky(colour)
-    ratios = []
-    for _ in range(20):
-        v = root @ rng.standard_normal(800)
-        covariance = covariance_of([psi], [v - psi @ (solve @ v)])
-        ratios.append(np.sqrt(np.diag(covariance) / np.diag(solve @ colour @ solve.T)))
-    assert np.abs(np.median(ratios, axis=0) - 1.0).max() < 0.15
-
-
-def test_covariance_follows_the_units():
-    psi, v = regressors(500), noise(np.random.default_rng(8), 500)
-    units = np.array([1e-6, 1.0, 1e6])
-    rescaled = covariance_of([1e3 * psi * units], [1e3 * v])
-    expected = covariance_of([psi], [v]) / np.outer(units, units)
-    assert largest_relative_error(rescaled, expected) < 1e-9
-
-
 def test_experiments_are_independent_of_each_other():
     psi = [regressors(150, 1), regressors(90, 2)]
     v = [noise(np.random.default_rng(1), 150), noise(np.random.default_rng(2), 90)]
@@ -215,11 +151,6 @@ DIRECTION = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, 2.0], [0.0, 2.0, 4.0]])
                 "hardly shows when the response begins",
             ),
         ),
-        (
-            covariance([0.1] * 5, [(2, 4, 0.9995)]),
-            *([1, 2, 3, 4, 5], FIVE, 4000.0, None),
-            ("can hardly distinguish", "hardly shows when the response begins"),
-        ),
         # Pairs that share a parameter are in one sentence.
         (
             covariance([0.1] * 5, [(0, 1, 0.9997), (1, 2, 0.9997), (0, 2, 0.9996)]),
@@ -248,7 +179,7 @@ DIRECTION = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, 2.0], [0.0, 2.0, 4.0]])
         ),
     ],
 )
-def test_what_is_said_of_a_covariance(C, theta, names, number, hessian, words):
+def test_descriptions_of_conditioning(C, theta, names, number, hessian, words):
     if hessian is None:
         hessian = np.linalg.inv(C) if np.isfinite(C).all() else UNDEFINED
     found = describe_conditioning(C, np.array(theta, dtype=float), names, number, np.asarray(hessian, dtype=float))

@@ -11,7 +11,6 @@ from ctid_cli.estimators.useful_redundancy import RedundantFit
 from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.fit import Fit, Status
-from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
@@ -49,15 +48,6 @@ def test_results_and_data_are_short_to_read():
 def test_coefficient_that_vanished_keeps_its_name():
     fit = make_fit(TransferFunction([0.0, 6.0], [1.0, 2.0, 3.0]), ("a1", "a2", "b0", "b1"))
     assert fit.parameters == {"a1": 2.0, "a2": 3.0, "b0": 0.0, "b1": 6.0}
-
-
-@pytest.mark.parametrize(("poles", "zeros"), [(1, 0), (3, 1), (4, 3)])
-@pytest.mark.parametrize("delay", [True, False])
-def test_structure_counts_and_names_its_parameters(poles, zeros, delay):
-    structure = Structure(poles, zeros, delay)
-    expected = [f"a{i}" for i in range(1, poles + 1)] + [f"b{j}" for j in range(zeros + 1)] + ["delay"] * delay
-    assert structure.names == tuple(expected)
-    assert structure.size == len(expected) == structure.signs.size == structure.sensitivity_rows.size
 
 
 @given(VALUES, st.integers(0, 2**31))

@@ -41,7 +41,7 @@ def test_bias_deviation_and_mean_square_are_those_of_the_table_of_morris():
     assert found.error == pytest.approx(found.value / np.sqrt(2 * 19_999), rel=0.03)
 
 
-def test_nothing_is_said_of_nothing():
+def test_too_few_values_have_no_measures():
     nothing = Sample(np.empty(0), np.empty(0))
     for measure in MEASURES.values():
         assert measure.compute(nothing if measure.source == "errors" else np.empty(0, dtype=bool)) == Measured()

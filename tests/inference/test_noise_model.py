@@ -43,21 +43,6 @@ def test_covariance_of_products_is_that_of_the_toeplitz_matrix(count):
     np.testing.assert_allclose(model.covariance_of(columns), expected, rtol=1e-9)
 
 
-def test_products_of_slow_noise_end_long_after_the_columns():
-    root = 0.99999
-    model = NoiseModel(np.array([1.0, -root]), np.array([1.0, root]) / (1.0 - root**2), 1.0)
-    expected = toeplitz(root ** np.arange(50)).sum() / (1.0 - root**2)
-    assert model.covariance_of(np.ones((50, 1)))[0, 0] == pytest.approx(expected, rel=1e-9)
-
-
-def test_white_noise_has_order_zero():
-    v = np.array([1.0, -1.0, -1.0, 1.0, 1.0, -1.0, -1.0, 1.0])
-    model = fit_noise_model([v], max_order=1)  # products at lag one: -1 1 -1 1 -1 1 -1, r(1)/r(0) = -1/8
-    assert model.order == 0
-    assert model.effective_count(77) == 77
-    assert NoiseModel(np.array([1.0, 0.5]), np.array([4 / 3, -2 / 3]), 1.0).effective_count(77) == 77
-
-
 def test_no_product_reaches_from_one_experiment_into_the_next():
     blocks = [np.array([1.0, 2.0, 3.0]), np.array([4.0, -1.0])]
     # r(0) = (1+4+9+16+1)/5, r(1) = (2+6-4)/5

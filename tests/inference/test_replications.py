@@ -10,7 +10,6 @@ import pytest
 
 from ctid_cli.inference.monte_carlo import (
     AT_LEAST,
-    GROWTH,
     Replications,
     Sample,
     Until,
@@ -92,7 +91,7 @@ def stopped(until: Until, draw: Any, at_most: int) -> list[Replications]:
     return found
 
 
-@pytest.mark.parametrize("probability", [0.5, 0.9, 0.98])
+@pytest.mark.parametrize("probability", [0.9])
 def test_intervals_of_percentages_keep_their_promise_under_the_rule(probability: float) -> None:
     rng = np.random.default_rng(round(1000 * probability))
     found = stopped(Until(percent_half_width=1.5), lambda n: of_hits(rng.random(n) < probability), 5000)
@@ -102,11 +101,3 @@ def test_intervals_of_percentages_keep_their_promise_under_the_rule(probability:
     assert inside >= 543
     assert max(high - low for low, high in intervals) <= 0.03
     assert len({one.hits.size for one in found if one.hits is not None}) > (1 if probability > 0.5 else 0)
-
-
-def test_intervals_of_errors_keep_their_promise_under_the_rule() -> None:
-    rng = np.random.default_rng(6)
-    found = stopped(Until(rmse_relative=0.08), lambda n: of_errors(rng.standard_normal(n)), 2000)
-    measured = [root_mean_square(Sample(one.errors[:, 0], one.errors[:, 0])) for one in found]
-    assert sum(one.low <= 1.0 <= one.high for one in measured if one.low is not None and one.high is not None) >= 543
-    assert np.mean([len(one.errors) for one in found]) < GROWTH * 1.1 * 0.5 * (1.96 / 0.08) ** 2

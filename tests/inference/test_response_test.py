@@ -39,18 +39,18 @@ def outcome(*records, delays=(0.0, 10.0), **options):
     return module.response_test(records, [record.valid for record in records], delays, **options)
 
 
-def answering(rng, n=400, share=0.36, colour=(1.0,), model=FIRST_ORDER):
+def record_with_response(rng, n=400, share=0.36, colour=(1.0,), model=FIRST_ORDER):
     """Return a record in which the model explains a fraction of the output variance."""
     u = next(inputs(rng, n))
     x = simulate(model, HeldSignal(np.arange(float(n)), u), np.arange(float(n)))
     return record_of(u, np.sqrt(share) * x / x.std() + np.sqrt(1 - share) * noise(rng, n, colour))
 
 
-def test_noise_seldom_passes_for_an_answer():
+def test_false_detections_in_noise_have_the_nominal_level():
     rng = np.random.default_rng(41)
     found = [
         outcome(record_of(u, noise(rng, 120, colour))).seen
-        for _ in range(4)
+        for _ in range(2)
         for colour in COLOURS
         for u in inputs(rng, 120)
     ]
@@ -61,26 +61,17 @@ def test_noise_seldom_passes_for_an_answer():
 
 
 @pytest.mark.parametrize("colour", [COLOURS[0], COLOURS[2]])
-def test_an_answer_that_fits_20_percent_is_seen(colour):
+def test_a_response_with_a_fit_of_20_percent_is_detected(colour):
     rng = np.random.default_rng(42)
-    found = [outcome(answering(rng, 500, colour=colour)).seen for _ in range(12)]
+    found = [outcome(record_with_response(rng, 500, colour=colour)).seen for _ in range(12)]
     # With a power of 95 %, at most two are missed in 98 of 100 such samples.
     assert sum(found) >= 10
-
-
-def test_one_step_in_noise_is_seen():
-    """The output of a step resembles slow noise; the residual of the response does not."""
-    rng = np.random.default_rng(52)
-    t = np.arange(300.0)
-    u = 1.0 * (t >= 100)
-    x = simulate(FIRST_ORDER, HeldSignal(t, u), t) / 0.47
-    assert all(outcome(record_of(u, 0.94 * x + 0.33 * noise(rng, 300, COLOURS[2]))).seen for _ in range(6))
 
 
 @pytest.mark.parametrize("initial_state", ["rest", "estimate"])
 def test_the_share_is_that_of_least_squares(initial_state):
     rng = np.random.default_rng(43)
-    record = answering(rng, 100)
+    record = record_with_response(rng, 100)
     t, y, best = record.t, record.y - record.y.mean(), 0.0
     for pole in module._poles(1.0, 99.0):
         denominator = np.real(np.poly([pole, pole.conjugate()] if np.imag(pole) else [pole]))
@@ -95,17 +86,7 @@ def test_the_share_is_that_of_least_squares(initial_state):
     assert found.explained == pytest.approx(best, rel=1e-6)
 
 
-def test_a_clock_with_holes_and_an_irregular_one():
-    rng = np.random.default_rng(46)
-    record = answering(rng)
-    y = np.where(rng.random(400) < 0.3, np.nan, record.y)
-    assert outcome(record_of(record.input.values, y)).seen
-    t = np.cumsum(rng.uniform(0.2, 1.8, 400))
-    x = simulate(FIRST_ORDER, record.input, t)
-    assert outcome(Record(t, x / x.std() + noise(rng, 400), record.input)).seen
-
-
-def test_a_long_record_is_averaged_and_a_fast_answer_is_still_seen():
+def test_a_fast_response_in_a_long_record_is_detected():
     rng = np.random.default_rng(47)
     u = rng.choice([-1.0, 1.0], 9000)
     assert outcome(record_of(u, np.append(0.0, u[:-1]) + noise(rng, 9000))).seen
@@ -113,7 +94,7 @@ def test_a_long_record_is_averaged_and_a_fast_answer_is_still_seen():
 
 
 @pytest.mark.parametrize("model", [([1.0], [1.0, 0.0]), ([1.0], [1.0, 0.005, 0.25]), ([-0.1, 0.01], [1.0, 0.2, 0.01])])
-def test_without_noise_an_answer_is_always_seen(model):
+def test_a_response_without_noise_is_detected(model):
     """Integrating and lightly damped systems, and one with a zero in the right half plane."""
     rng = np.random.default_rng(48)
     t = np.arange(300.0)
@@ -135,21 +116,13 @@ def test_free_responses_and_steady_states():
     assert not outcome(falling, initial_state="estimate").seen
 
 
-def test_outliers_hide_no_answer():
-    rng = np.random.default_rng(50)
-    record = answering(rng, share=0.9)
-    y = record.y.copy()
-    y[rng.choice(400, 15, replace=False)] += 50.0 * rng.choice([-1.0, 1.0], 15)
-    assert outcome(record_of(record.input.values, y)).seen
-
-
 def test_what_cannot_be_tested_is_not_denied():
     rng = np.random.default_rng(51)
     held = record_of(np.ones(100), noise(rng, 100))
     # From rest, a constant input is a step.
     assert np.isfinite(outcome(held).p_value)
     still = Record(held.t, held.y, HeldSignal(held.t - 1e6, np.zeros(100)))
-    for found in (outcome(still), outcome(answering(rng, 7))):
+    for found in (outcome(still), outcome(record_with_response(rng, 7))):
         assert np.isnan(found.p_value)
         assert found.seen
     assert outcome(record_of(next(inputs(rng, 100)), np.full(100, 3.0))).p_value == 1.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import toeplitz
 
-from ctid_cli.inference.bounds import finite_record_covariance, limiting_accuracy
+from ctid_cli.inference.bounds import finite_record_covariance
 from ctid_cli.inference.sensitivities import sensitivities
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
@@ -51,28 +51,6 @@ def test_covariance_is_the_double_sum_over_all_pairs_of_samples():
     np.testing.assert_allclose(
         finite_record_covariance(psi, [0.3, 0.1]), finite_record_covariance(psi, padded), rtol=1e-9
     )
-
-
-def test_long_records_approach_the_limit():
-    count = 20_000
-    times = 0.05 * np.arange(count)
-    signal = HeldSignal(times, 2.0 * np.random.default_rng(0).standard_normal(count))
-    noise = ArmaNoise(numerator=(1.0, 0.5), denominator=(1.0, -0.85), innovation_variance=0.02)
-    limit = limiting_accuracy(
-        MODES,
-        0.05,
-        standard_deviation=2.0,
-        innovation_variance=0.02,
-        noise_filter=noise.filter,
-        samples=count,
-    )
-    psi = sensitivities(MODES, signal, times)
-    covariance = finite_record_covariance(psi, noise.autocovariance(np.arange(2000)))
-    ratios = np.sqrt(np.diag(covariance)) / limit.standard_errors
-    # The least damped mode has a time constant of 5 s: about a hundred independent sections.
-    assert np.abs(ratios - 1).max() < 0.1
-    white = np.sqrt(np.diag(finite_record_covariance(psi, 0.02)))
-    assert np.abs(white / limit.standard_errors - 1).min() > 0.3
 
 
 def test_covariance_is_undefined_where_the_data_say_nothing():

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from ctid_cli.inference.signal_features import growth_time, outliers, residual_outliers, saturated
 
 
-def test_one_sample_in_twenty_may_be_wild():
+def test_one_sample_in_twenty_may_be_an_outlier():
     rng = np.random.default_rng(0)
     y = rng.standard_normal(300)
     wild = 5 + 20 * np.arange(14)
@@ -16,11 +15,6 @@ def test_one_sample_in_twenty_may_be_wild():
     found, off = residual_outliers(y)
     np.testing.assert_array_equal(found, wild)
     assert off == pytest.approx(50.0, abs=5.0)
-
-
-def test_peaks_of_smooth_residuals_are_no_outliers():
-    e = lfilter([1.0], np.poly([0.95, 0.95, 0.9]), np.random.default_rng(1).standard_normal(400))
-    assert residual_outliers(e)[0].size == 0
 
 
 def test_a_few_samples_at_one_limit_are_cut_off():

@@ -1,6 +1,7 @@
 """Noise model of the standard errors, in every estimator with the option."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -36,6 +37,7 @@ def record(colour):
     return Record(t, simulate(TransferFunction([2.0], [1.0, 2.0], DELAY), u, t) + noise, u)
 
 
+@cache
 def fitted(name, colour, covariance, feedback=False, **options):
     start = Start(delay=0.3) if name == "td_srivc" else None
     given = replace(record(colour), feedback=feedback)

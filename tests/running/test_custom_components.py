@@ -172,7 +172,7 @@ def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(fil
         ([*OWN, asked("Random")], "measures.Random: depends on the global random state"),
     ],
 )
-def test_what_shows_on_the_first_data_set_is_said_before_the_run(file, overrides, said):
+def test_errors_on_the_first_data_set_are_raised_before_the_run(file, overrides, said):
     with pytest.raises(SpecError, match=said):
         planned(file, *overrides)
 
@@ -195,10 +195,6 @@ UNKNOWN = "returns mean; true values are known of a1, b0, delay only"
 def test_what_is_odd_on_the_first_data_set_is_a_warning(file, overrides, words):
     heard = [text for text in planned(file, *overrides).spec.warnings if "estimators." in text]
     assert [word in text for text, word in zip(heard, words, strict=True)] == [True] * len(words)
-
-
-def test_a_component_that_ends_the_process_is_left_to_the_run(file):
-    assert planned(file, "estimators.bad.mischief=always").data_sets == 2
 
 
 def test_the_value_of_a_measure_is_stored_with_every_estimate_and_in_every_table(file, tmp_path):

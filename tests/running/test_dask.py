@@ -70,7 +70,7 @@ def test_a_worker_of_several_threads_is_refused(tmp_path: Path) -> None:
         run(plan(), tmp_path, dask=made.scheduler_address)
 
 
-def test_a_scheduler_that_does_not_answer_is_named(tmp_path: Path) -> None:
+def test_an_unreachable_scheduler_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="there is no dask scheduler at nowhere://1"):
         run(plan(), tmp_path / "toys", dask="nowhere://1")
     assert not (tmp_path / "toys").exists()

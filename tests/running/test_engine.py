@@ -140,14 +140,6 @@ def test_every_estimate_of_the_plan_is_stored_once_in_its_order_and_then_reporte
     assert (seen[-1].done, seen[-1].failed) == (6, 0)
 
 
-def test_a_finished_experiment_is_left_as_it_is(tmp_path: Path) -> None:
-    run(toy_plan(), tmp_path)
-    before = exported(tmp_path)
-    summary = run(toy_plan(), tmp_path, warm=lambda plan: pytest.fail("nothing is to be compiled"))
-    assert (summary.computed, summary.reused, summary.missing) == (0, 36, 0)
-    assert exported(tmp_path) == before
-
-
 def test_only_what_is_new_is_computed(tmp_path: Path) -> None:
     run(toy_plan(Toy(), runs=2), tmp_path)
     more_runs = run(toy_plan(Toy(), runs=3), tmp_path)
@@ -161,16 +153,6 @@ def test_only_what_is_new_is_computed(tmp_path: Path) -> None:
     assert (status.planned, status.done, status.left_aside) == (8, 8, 10)
     run(toy_plan(Toy(), runs=2), tmp_path / "alone")
     assert exported(tmp_path) == exported(tmp_path / "alone")
-
-
-def test_the_spec_lies_beside_the_results_and_the_journal_says_where_they_come_from(tmp_path: Path) -> None:
-    run(toy_plan(text="# as the user wrote it\n"), tmp_path)
-    assert (tmp_path / "spec.yaml").read_text() == "# as the user wrote it\n"
-    with read_journal(tmp_path / "journal.sqlite") as log:
-        assert log is not None
-        assert {"host", "argv", "packages", "limits"} <= set(log.sessions()[0].info)
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"spec.yaml", "journal.sqlite", "runs.h5"}
 
 
 # Misbehaving estimators
@@ -341,7 +323,7 @@ def test_refused_folders_stay_as_they_are(
     assert snapshot(tmp_path) == before
 
 
-def test_a_second_run_is_refused_and_told_who_runs(tmp_path: Path, start: Start) -> None:
+def test_a_second_run_is_refused_and_the_running_process_is_named(tmp_path: Path, start: Start) -> None:
     place = tmp_path / "toys"
     process = start(place, 2, "--runs=500")
     read_ids(process, 2)
@@ -409,15 +391,3 @@ def test_a_full_disk_loses_nothing_that_was_reported(tmp_path: Path, undisturbed
     assert group_is_gone(process, within=5)
     run(run_toys.plan(), place)
     assert exported(place) == undisturbed
-
-
-def test_preview_counts_without_writing(tmp_path: Path) -> None:
-    place = tmp_path / "toys"
-    first = preview(toy_plan(), place)
-    assert (first.data_sets, first.estimates, first.reused) == (12, 36, 0)
-    assert not place.exists()
-    run(toy_plan(runs=2), place)
-    before = snapshot(place)
-    second = preview(toy_plan(), place)
-    assert (second.data_sets, second.estimates, second.reused) == (8, 24, 12)
-    assert snapshot(place) == before

@@ -129,7 +129,7 @@ class Fraction(Toy):
         return FractionFit(TransferFunction([2.0], [1.0, 3.0, 4.0]), {"b0": 0.3, "a1": 0.1, "a2": 0.2}, 1.0)
 
 
-def test_starts_are_told_the_true_system_and_fractions_the_submodels_to_find() -> None:
+def test_starts_receive_the_true_system_and_fractions_are_factored() -> None:
     told: list[Any] = []
 
     @dataclass(frozen=True)

@@ -96,7 +96,7 @@ def test_a_higher_limit_is_a_reason_to_try_again(tmp_path: Path) -> None:
     assert (summary.computed, summary.failed) == (1, 0)
 
 
-def test_failures_are_tried_again_when_asked(tmp_path: Path) -> None:
+def test_failures_are_computed_again_on_request(tmp_path: Path) -> None:
     marker = tmp_path / "marker"
     hostile = [Toy("speak in halves", at=1, order=5, marker=str(marker)), Toy(order=6), Toy("die", at=0, order=7)]
     place, plan = tmp_path / "toys", toys(*hostile)
@@ -129,7 +129,9 @@ def test_texts_that_no_file_can_hold_are_stored_readably(tmp_path: Path) -> None
         ("fill the disk", "[Errno 28]", "TMPDIR"),
     ],
 )
-def test_what_the_machine_does_is_told_and_not_stored(tmp_path: Path, mischief: str, said: str, advice: str) -> None:
+def test_failures_of_the_machine_are_reported_and_not_stored(
+    tmp_path: Path, mischief: str, said: str, advice: str
+) -> None:
     marker, seen = tmp_path / "marker", list[Progress]()
     place, plan = tmp_path / "toys", toys(Toy(mischief, at=1, order=5, marker=str(marker)))
     summary = run(plan, place, progress=seen.append)

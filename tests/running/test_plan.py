@@ -83,28 +83,6 @@ def test_tasks_and_keys(plan_of):
     ]
 
 
-def test_without_starts_every_estimator_runs_once(plan_of):
-    plan = plan_of(text=SPEC.replace("starts: {initial_delay: [3, {uniform: [0, 9]}]}\n", ""))
-    assert [(cell.name, start.label) for _, cell, start in plan.keys(0, 0)] == [
-        ("search", "none"),
-        ("known", "none"),
-    ]
-    assert [start.label for start in plan.starts] == ["none"]
-    assert plan.starts[0].draw(None, 0) is None
-
-
-def test_columns_of_swept_fields(plan_of):
-    plan = plan_of("system.delay=[1,2]", "estimators.known.delay=[1,2]", "sampling.low=[0.05,0.06]")
-    assert set(plan.data_cells[0].swept) == {"system.delay", "sampling.low", "snr_db"}
-    assert plan.estimators[1].swept == {"estimator.delay": 1.0}, "delay is the estimated one"
-    nested = plan_of(
-        "estimators.search.lowpass={cutoff: [0.5, 1], order: 2}", "excitation={kind: gaussian, clock_period: [0.5, 1]}"
-    )
-    assert nested.estimators[0].swept == {"cutoff": 0.5}
-    assert nested.estimators[1].estimator.lowpass.cutoff == 1.0
-    assert nested.data_cells[0].swept == {"clock_period": 0.5, "snr_db": 5.0}
-
-
 @pytest.mark.parametrize(
     "override",
     [

@@ -1,7 +1,5 @@
 """Experiments with several inputs: sum of single-input data sets, and estimates under the names of all inputs."""
 
-from copy import deepcopy
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ from ctid_cli.running.plan import build_plan
 from ctid_cli.running.trial import load_tried
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.manifest import true_values
-from ctid_cli.storage.truth import found_of_rows, satisfied
+from ctid_cli.storage.truth import found_of_rows
 
 FIRST = {
     "system": {"numerator": [2.0], "denominator": [1.0, 1.0], "delay": 0.3},
@@ -64,38 +62,6 @@ def test_outputs_add_up_and_inputs_have_random_numbers_of_their_own():
     parts = data.true_model.parts
     assert list(parts) == ["u1", "u2"]
     assert (parts["u2"].delay, data.true_model.common) == (0.5, False)
-
-
-def test_a_common_denominator_is_one_in_the_truth_too():
-    same = {**SECOND, "system": {**SECOND["system"], "denominator": [2.0, 2.0]}}
-    common = {**OF_ONE, "zeros": 0, "inputs": [{"name": "u2", "delay_bounds": [0.5, 0.5]}]}
-    data, fit, found = fitted(spec(common, same))
-    truth = data.true_model.parameters
-    assert list(truth) == ["a1", "u1_b0", "u2_b0", "u1_delay", "u2_delay"]
-    assert np.all(np.abs(found.values[0, :3] - list(truth.values())[:3]) < 5 * found.standard_errors[0, :3])
-    rule = {"delay_relative_error": 0.01, "parameter_relative_error": 0.5}
-    row = data.result_of(fit, None, None)
-    arrays = {"status": np.array([row["status"].encode()])}
-    assert satisfied(rule, truth, arrays, found.values, None).all()
-    assert not satisfied(rule, truth, arrays, found.values * [1, 1, 1, 1, 1.1], None).any()
-
-
-def test_coefficients_are_compared_by_their_power():
-    names = ["u1_a1", "u2_a1", "u1_b0", "u2_b0", "u1_delay", "u2_delay"]
-    own = {"u1_a1": 1.0, "u2_a1": 0.6, "u1_b0": 0.1, "u1_b1": 2.0, "u2_b0": -1.5, "u1_delay": 0.3, "u2_delay": 0.5}
-    other = {**own, "u2_a2": 0.1}
-    rows = [{"status": "CONVERGED", "parameters": parameters} for parameters in (own, other)]
-    found = found_of_rows(rows, names).values
-    np.testing.assert_array_equal(found[0], [1.0, 0.6, 2.0, -1.5, 0.3, 0.5])
-    np.testing.assert_array_equal(found[1], [np.nan] * 4 + [0.3, 0.5])
-
-
-def test_swept_values_of_an_input_make_data_cells():
-    several = deepcopy(spec())
-    several["inputs"]["u2"]["system"]["delay"] = [0.4, 0.5]
-    cells = build_plan(load_spec(several)).data_cells
-    assert [cell.swept for cell in cells] == [{"inputs.u2.system.delay": 0.4}, {"inputs.u2.system.delay": 0.5}]
-    assert [cell.dataset(0).true_model.parts["u2"].delay for cell in cells] == [0.4, 0.5]
 
 
 @pytest.mark.parametrize(

@@ -5,15 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from ctid_cli.inference.bounds import EstimatedForm, accuracy_of_records
 from ctid_cli.inference.intervals import normal_quantile
 from ctid_cli.inference.uncertainty import BootstrapT, Uncertainty
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import factored, factored_jacobian, unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.noise import WhiteNoise
-from ctid_cli.signals.record import Record
 from ctid_cli.simulation.dataset import additive_parameters
 
 MODES = AdditiveModel([Submodel([0.1, 3.0], [0.25, 0.25, 1.0]), Submodel([0.02, 1.0], [0.025, 0.01, 1.0])])
@@ -111,28 +107,3 @@ def test_a_sum_of_submodels_is_what_it_is():
 def test_fractions_that_have_no_such_submodels(denominator, terms):
     fit = FractionFit(TransferFunction([1.0], denominator), ("a1", "a2", "b0"), np.eye(3))
     assert additive_parameters(fit, terms) == (None, {}, {})
-
-
-def test_real_poles_are_neighbours_in_a_submodel_of_the_second_order():
-    poles = TransferFunction([1.0], np.poly([-1.0, -2.0, -30.0, -40.0]))
-    fit = FractionFit(poles, ("a1", "a2", "a3", "a4", "b0"), np.eye(5))
-    parameters, *_ = additive_parameters(fit, TERMS)
-    assert parameters["g1_a2"] == pytest.approx(1 / 2)
-    assert parameters["g2_a2"] == pytest.approx(1 / 1200)
-
-
-def test_theory_of_one_mode_with_a_searched_delay_is_that_of_its_fraction():
-    mode = AdditiveModel.from_theta([0.3, 0.25, 1.0], (Term(2, 0),), 0.237)
-    t = 0.1 * np.arange(300)
-    record = Record(t, np.zeros(300), HeldSignal(t, np.random.default_rng(0).choice([-1.0, 1.0], 300)))
-    noise, of_sum, of_fraction = (
-        WhiteNoise(variance=0.01),
-        *(EstimatedForm(model, 0, 0.0, "open_loop") for model in (mode, unfactored(mode))),
-    )
-    one, other = (
-        accuracy_of_records(form, form.model, [record], noise, "it is short").parameters
-        for form in (of_sum, of_fraction)
-    )
-    assert one.names == ("g1_a1", "g1_a2", "g1_b0", "delay")
-    assert (one.values[-1], other.values[-1]) == (0.237, 0.237)
-    np.testing.assert_allclose(one.standard_errors[-1], other.standard_errors[-1], rtol=1e-6)

@@ -1,14 +1,11 @@
 """Data sets of sums of submodels, in open and closed loop: equations satisfied by their records."""
 
-import pickle
-
 import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
@@ -71,37 +68,9 @@ def test_a_data_set_is_the_simulated_loop_of_its_streams(name, enters):
     assert (record.loop.controller, record.loop.enters) == (LEAD, enters)
 
 
-def test_a_loop_without_gain_is_an_open_loop():
-    closed = source(controller=DiscreteController([0.0], [1.0]), enters="input").dataset(2).record
-    opened = SimulatedSource(MODES, Gaussian(), RECORD, WhiteNoise(variance=0.01), 5).dataset(2).record
-    np.testing.assert_allclose(closed.y, opened.y, atol=1e-12)
-    np.testing.assert_array_equal(closed.input.values, opened.input.values)
-    assert opened.loop is None
-
-
-def test_longer_records_begin_with_the_shorter_ones_and_data_sets_repeat():
-    short, long = (source(sampling=RegularSampling(0.05, count)) for count in (200, 400))
-    np.testing.assert_allclose(long.dataset(0).record.y[:200], short.dataset(0).record.y, atol=1e-13)
-    sent = pickle.loads(pickle.dumps(long))
-    np.testing.assert_array_equal(sent.dataset(0).record.y, long.dataset(0).record.y)
-    assert not np.array_equal(long.dataset(1).record.y, long.dataset(0).record.y)
-
-
 def test_an_irregular_loop_is_refused():
     with pytest.raises(DataError, match="a closed loop needs a regular clock"):
         source(sampling=UniformIntervals(0.04, 0.06, 50)).dataset(0)
-
-
-@pytest.mark.parametrize("name", ["modes", "delayed modes", "rigid body and mode"])
-def test_open_loop_data_sets_of_submodels(name):
-    system = SYSTEMS[name]
-    sampling = UniformIntervals(0.04, 0.06, 300, input_record="exact")
-    record = SimulatedSource(system, Gaussian(clock_period=0.5), sampling, None, 5).dataset(0).record
-    total = np.zeros(300)
-    for submodel in system.submodels:
-        part = submodel.transfer_function()
-        total += simulate(TransferFunction(part.numerator, part.denominator, system.delay), record.input, record.t)
-    np.testing.assert_allclose(record.y, total, atol=1e-9)
 
 
 def test_a_measured_loop(tmp_path):
@@ -118,32 +87,6 @@ def test_a_measured_loop(tmp_path):
     shift = simulated.loop.reference[:100].mean()
     np.testing.assert_allclose(part.record.loop.reference, simulated.loop.reference[:100] - shift, atol=1e-15)
     assert part.validation.loop is None
-
-
-def test_a_reference_file_has_no_say_in_the_identity_by_its_place(tmp_path):
-    text = """\
-experiment: loop
-system: {additive: [{numerator: [3], denominator: [0.25, 0.25, 1]}]}
-loop: {controller: {pid: {kp: 0.01}}, reference: {kind: file, file: reference.csv}}
-sampling: {kind: regular, interval: 0.05, samples: 100}
-estimators: {one: {kind: srivc, poles: 2, zeros: 0}}
-monte_carlo: {runs: 1, seed: 1}
-"""
-    cells = []
-    for place in (tmp_path, tmp_path / "elsewhere"):
-        place.mkdir(exist_ok=True)
-        (place / "reference.csv").write_text("t,u\n0,1\n2,-1\n")
-        (place / "spec.yaml").write_text(text)
-        (cell,) = build_plan(load_spec(place / "spec.yaml")).data_cells
-        assert cell.source.loop.reference.sha256 == file_sha256(str(place / "reference.csv"))
-        assert "file" not in cell.content["loop"]["reference"]
-        assert cell.dataset(0).record.loop.reference[[0, 39, 40]].tolist() == [1.0, 1.0, -1.0]
-        cells.append(cell)
-    assert cells[0].hash == cells[1].hash
-    (tmp_path / "reference.csv").write_text("t,u\n0,1\n2,-2\n")
-    with pytest.raises(DataError, match="differs from that of the planned experiment"):
-        cells[0].dataset(0)
-    assert build_plan(load_spec(tmp_path / "spec.yaml")).data_cells[0].hash != cells[0].hash
 
 
 CONTINUOUS = UNSTABLE.replace(

@@ -86,7 +86,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_is_no_fit_is_said_to_be_none(case, record):
+def test_invalid_results_are_refused(case, record):
     found, words = REFUSED[case]
     with pytest.raises(ComponentError) as caught:
         taken(found, record, "E.fit")
@@ -110,7 +110,7 @@ def replaced(record):
 
 
 @pytest.mark.parametrize("mischief", [set_flags, write, replaced])
-def test_a_record_that_an_estimator_changes_is_the_same_for_the_next(mischief, record):
+def test_changes_of_a_record_are_refused_and_undone(mischief, record):
     y, u = record.y.copy(), record.input.values.copy()
     with pytest.raises(ComponentError, match=r"Answer.fit changes the record that it is given; copy first"):
         CustomEstimation(Answer(mischief)).prepare(record).fit()
@@ -118,7 +118,7 @@ def test_a_record_that_an_estimator_changes_is_the_same_for_the_next(mischief, r
     np.testing.assert_array_equal(record.input.values, u)
 
 
-def test_an_estimator_keeps_nothing_from_one_fit_to_the_next_and_is_not_told_the_truth(record):
+def test_a_custom_estimator_is_copied_for_each_fit_and_receives_no_truth(record):
     given = []
     options = Answer(lambda record: given.append(record.noise_free) or {"parameters": {"k": 1.0}})
     prepared = CustomEstimation(options).prepare(record)

@@ -54,17 +54,12 @@ def test_replicates_differ_and_repeat():
     np.testing.assert_array_equal(sent.dataset(0).record.y, first.y)
 
 
-def test_what_the_estimator_is_told_of_the_input():
+def test_the_input_record_is_sampled_or_exact():
     sampled, exact = record_of(), record_of("sampling.input_record=exact")
     np.testing.assert_array_equal(sampled.noise_free, exact.noise_free)
     np.testing.assert_array_equal(sampled.input.t, sampled.t)
     np.testing.assert_array_equal(exact.input.t, 0.5 * np.arange(exact.input.t.size))
     np.testing.assert_array_equal(sampled.input.values, exact.input.at(sampled.t))
-
-
-def test_without_noise_the_output_is_noise_free():
-    record = record_of("noise=null")
-    np.testing.assert_array_equal(record.y, record.noise_free)
 
 
 def test_random_starts():
@@ -125,14 +120,3 @@ def test_a_record_that_changed_since_is_refused(file):
     # Its results can still be read.
     assert build_plan(spec_from_canonical(plan.spec.canonical())).data_cells[0].hash == plan.data_cells[0].hash
     assert plan_of(spec=measured(file)).data_cells[0].hash != plan.data_cells[0].hash
-
-
-def test_an_input_from_a_file(file):
-    overrides = [
-        f"excitation={{kind: file, file: {file}, hold: foh}}",
-        "sampling={kind: regular, interval: 0.1, samples: 99}",
-        "system.delay=0.5",
-    ]
-    record = record_of(*overrides)
-    np.testing.assert_allclose(record.input.values, read_record(file).input.values[:99])
-    assert record.input.hold == "foh", "samples of straight lines are joined by straight lines"

@@ -12,7 +12,7 @@ SYSTEM = TransferFunction([2], [0.5, 1])
 SOURCE = SimulatedSource(SYSTEM, Gaussian(), RegularSampling(0.1, samples=400), WhiteNoise(snr_db=0.0), 3, fresh=True)
 
 
-def test_a_model_is_tried_on_data_that_it_has_not_seen():
+def test_fresh_fit_is_computed_on_independent_data():
     data, other = SOURCE.dataset(2), SOURCE.dataset(FRESH + 2).record
     fit = Srivc(1, 0).fit(data.record)
     found = data.result_of(fit, None, None)["fresh_fit_percent"]
@@ -22,7 +22,7 @@ def test_a_model_is_tried_on_data_that_it_has_not_seen():
     assert abs(np.corrcoef(other.y, data.record.y)[0, 1]) < 0.2
 
 
-def test_it_is_computed_where_it_is_asked_for_only(tmp_path):
+def test_fresh_fit_is_computed_only_as_a_measure(tmp_path):
     file = tmp_path / "fresh.yaml"
     file.write_text(
         "experiment: fresh\n"

@@ -6,7 +6,7 @@ from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.sections import geometric_sizes
 from tests.specification.written import CLOSED_LOOP as CLOSED
-from tests.specification.written import changed, load
+from tests.specification.written import load
 
 
 def test_it_is_accepted(tmp_path):
@@ -42,24 +42,7 @@ def test_what_can_be_swept(tmp_path):
     ]  # fmt: skip
 
 
-def test_open_loop_with_integrators(tmp_path):
-    text = changed(
-        CLOSED,
-        ("numerator: [3], denominator: [0.25, 0.25, 1]", "numerator: [3], denominator: [0.25, 1], integrators: 1"),
-        (CLOSED[CLOSED.index("loop:") : CLOSED.index("sampling:")], "excitation: {kind: gaussian}\n"),
-        ("[{poles: 2, zeros: 0}, {poles: 2, zeros: 0}], instruments: closed_loop",
-         "[{poles: 1, zeros: 0, integrators: 1}, {poles: 2, zeros: 0}]"),
-        ("zeros: 2, instruments: closed_loop", "zeros: 2"),
-    )  # fmt: skip
-    plan = build_plan(load(tmp_path, text))
-    assert plan.data_cells[0].source.system.terms == (Term(1, 0, 1), Term(2, 0))
-    assert plan.terms == (Term(1, 0, 1), Term(2, 0))
-    record = plan.data_cells[0].dataset(0).record
-    assert record.loop is None
-    assert record.n_samples == 500
-
-
-def test_fractions_are_taken_apart_as_the_sorted_system_is(tmp_path):
+def test_fractions_are_factored_like_the_sorted_system(tmp_path):
     system = "system.additive=[{numerator: [1], denominator: [0.1, 1]}, {numerator: [3], denominator: [0.2, 0.3, 1]}]"
     rest = ["loop=null", "excitation={kind: gaussian}", "starts=null"]
     one = "estimators={one: {kind: srivc, poles: 3, zeros: 2}}"

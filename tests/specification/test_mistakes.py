@@ -36,7 +36,7 @@ def said(folder, base, case):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_is_said_and_nothing_else(tmp_path, name, monkeypatch):
+def test_messages(tmp_path, name, monkeypatch):
     # In this process: components that end their process are tested elsewhere.
     monkeypatch.setattr(trial, "call_alone", lambda folder, function, *given: (function(*given), "", 0.0))
     base, case = CASES[name]

@@ -126,7 +126,7 @@ THOUSAND = f"[{', '.join(str(k / 10) for k in range(1, 1002))}]"
         ((REGULAR, THOUSAND, THOUSAND, 1), "1001 data cells and 1001 estimators .* at most 1000000"),
     ],
 )
-def test_more_than_anybody_computes(values, said, inside):
+def test_too_large_experiments_are_refused(values, said, inside):
     (inside / "many.yaml").write_text(SIMULATED % values)
     with pytest.raises(SpecError, match=said):
         load_spec(inside / "many.yaml")

@@ -178,23 +178,6 @@ def test_success_rule(
     assert (None if hits is None else hits.tolist()) == (None if expected is None else [expected])
 
 
-def test_coefficients_go_with_their_errors_by_their_power_of_s() -> None:
-    errors = {"b0": 0.3, "b1": 0.4, "a1": 0.1}
-    model = {"numerator": [9.0, 2.0], "denominator": [1.0, 3.0], "standard_errors": errors}
-    dropped = model | {"numerator": [2.0]}
-    two_zeros = {"numerator": [2.0], "denominator": [1.0, 3.0]}
-    arrays = arrays_of_rows([model, dropped, {"delay": 0.5}, two_zeros])
-    nan = np.nan
-    for names, values, deviations in (
-        (("b0", "a1"), [[2, 3], [2, 3], [nan] * 2, [2, 3]], [[0.4, 0.1], [0.4, 0.1], [nan] * 2, [nan] * 2]),
-        (("b0", "b1", "a1"), [[9, 2, 3], [0, 2, 3], [nan] * 3, [0, 2, 3]], None),
-    ):
-        found = found_under(names, arrays, 4)
-        np.testing.assert_array_equal(found.values, np.array(values, dtype=float))
-        if deviations is not None:
-            np.testing.assert_array_equal(found.standard_errors, np.array(deviations))
-
-
 def test_true_values_are_those_of_the_estimated_form() -> None:
     submodels = [{"numerator": [2.0], "denominator": [0.1, 1.0]}, {"numerator": [3.0], "denominator": [2.0, 1.0]}]
     # Monic, and sums of submodels by ascending natural frequency.

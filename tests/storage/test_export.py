@@ -92,7 +92,7 @@ def test_extreme_contents_come_back(tmp_path: Path) -> None:
 
 def test_every_flipped_bit_of_data_is_found_without_a_journal(path: Path) -> None:
     intact, rng, found = path.read_bytes(), np.random.default_rng(5), 0
-    positions = rng.integers(0, len(intact), 300).tolist()
+    positions = rng.integers(0, len(intact), 120).tolist()
     for position in positions:
         damaged = bytearray(intact)
         damaged[position] ^= 1 << int(rng.integers(8))
@@ -101,7 +101,7 @@ def test_every_flipped_bit_of_data_is_found_without_a_journal(path: Path) -> Non
             assert read(path) == RESULTS, "what HDF5 does not use"
         except (StorageError, RefusedError):
             found += 1
-    assert found > 100
+    assert found > 40
     path.write_bytes(intact[: len(intact) // 2])
     with pytest.raises(StorageError, match=r"cannot be read"):
         read(path)
@@ -175,7 +175,7 @@ def test_it_is_written_once_and_again_when_it_is_not_what_was_written(path: Path
     log.close()
 
 
-def test_a_full_disk_is_said_in_one_sentence_and_leaves_nothing_behind(path: Path) -> None:
+def test_a_full_disk_gives_one_sentence_and_leaves_no_file(path: Path) -> None:
     log, most = open_journal(path.with_name("journal.sqlite")), resource.getrlimit(resource.RLIMIT_FSIZE)
     path.unlink()
     before = {file.name for file in path.parent.iterdir()}

@@ -12,7 +12,6 @@ from ctid_cli.estimation.optimum.projection import Problem, project, slopes
 from ctid_cli.estimation.optimum.triangle import Columns, Delay, rows_of, triangle_of
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.models.additive import Term
-from ctid_cli.signals.record import Record
 from tests.estimation.optimum.dense import columns_of, left_over, squared_error
 from tests.estimation.optimum.systems import MODEL, record_of
 
@@ -103,15 +102,6 @@ def test_a_sample_belongs_to_the_cells_on_both_sides(cell):
     assert slopes(problem, SPEED, DAMPING, at, here, (0,)).gradient[-1] == pytest.approx(slope, rel=1e-5)
 
 
-def test_masked_samples_do_not_count():
-    record = record_of(MODEL, np.random.default_rng(5), noise=0.1)
-    y = record.y.copy()
-    y[[0, 1, 17, 18, 240]] = np.nan
-    masked = Record(record.t, y, record.input)
-    found = project(problem_of(masked, 2, True, True), SPEED, DAMPING, Delay(0.37, -1)).squared_error
-    np.testing.assert_allclose(found, squared_error(masked, DENOMINATOR, 2, 0.37, True, True), rtol=1e-8)
-
-
 @pytest.mark.parametrize(("free_response", "offset"), [(False, False), (True, False), (False, True), (True, True)])
 def test_records_share_the_numerator_and_have_their_own_state_and_offset(free_response, offset):
     rng = np.random.default_rng(7)
@@ -126,20 +116,6 @@ def test_records_share_the_numerator_and_have_their_own_state_and_offset(free_re
     found_slopes = slopes(problem, SPEED, DAMPING, delay, found, (0,))
     ends = [project(problem, SPEED, DAMPING, Delay(0.37 + step, -1)).squared_error for step in (-1e-5, 1e-5)]
     assert found_slopes.gradient[-1] == pytest.approx((ends[1] - ends[0]) / 4e-5, rel=1e-6)
-
-
-def test_double_poles_are_no_special_case():
-    # Two real sections coincide, and a section passes a damping of 1.
-    record = record_of(MODEL, np.random.default_rng(6), noise=0.1)
-    problem = problem_of(record, 2)
-    apart = project(problem, np.array([2.0, 2.0, 0.5]), -np.ones(3), Delay(0.0, -1)).squared_error
-    together = project(problem, np.array([2.0, 0.5]), np.array([1.0, -1.0]), Delay(0.0, -1)).squared_error
-    assert together == pytest.approx(apart, rel=1e-10)
-    below, above = (
-        project(problem, np.array([2.0, 0.5]), np.array([1.0 + d, -1.0]), Delay(0.0, -1)).squared_error
-        for d in (-1e-6, 1e-6)
-    )
-    assert below + above == pytest.approx(2 * together, rel=1e-10)
 
 
 @pytest.mark.parametrize("length", [100.0, 1e-6])

@@ -86,16 +86,3 @@ def test_wherever_it_starts_a_search_does_not_rise():
         ends = descent.descend(start)
         assert ends.squared_error <= descent.value(start).squared_error
         assert ends.squared_error == pytest.approx(descent.value(ends.point).squared_error, rel=1e-9)
-
-
-def test_without_a_delay_the_slope_is_that_of_a_later_input():
-    # Every sample of an irregular record coincides with an edge of its input, at which the cost has a kink.
-    rng = np.random.default_rng(5)
-    record = record_of(TransferFunction([0.5], [1.0, 0.5], 0.3), rng, samples=60, regular=False)
-    data = filter_data(record)
-    problem = Problem((data,), 0, False, (), (0.0,))
-    box = box_of(problem, (0.0, 5.0))
-    descent = Descent(problem, box)
-    here, later = (point_of(np.array([-0.4 + 0j]), delay, box) for delay in (0.0, 1e-5))
-    rise = descent.value(later).squared_error - descent.value(here).squared_error
-    assert descent.local(here).gradient[-1] / box.quarter == pytest.approx(0.5 * rise / 1e-5, rel=1e-3)
