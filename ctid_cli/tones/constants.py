@@ -80,6 +80,8 @@ INDEPENDENT = 0.8
 LEVEL = 5e-4
 #: Factor of the p-value of the test for changes, 3.6 c exp(-c/2), measured on windows of 64 to 1000 samples.
 CHANGE_TAIL = 3.6
+#: Share of the window at each end in which no change is searched for.
+ENDS = 0.05
 #: Lines added together with the strongest one, to save time only: their number, bins between them, and the share of
 #: its energy that they exceed.
 FURTHER = 4
@@ -108,7 +110,7 @@ STEADY_ROUNDS = 2
 STEADY_STEPS = 8
 STEADY_STEP = 4
 #: Samples of the windows that are computed together, which fit in the cache. No result depends on it.
-BLOCK_SAMPLES = 2**17
+BLOCK_SAMPLES = 2**16
 
 # --- residuals ------------------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Detection of lines in the residuals of windows: noise spectrum, noise floor and strongest ordinates."""
+"""Detection of lines and changes in the residuals of windows."""
 
 from typing import NamedTuple
 
@@ -189,3 +189,33 @@ def _clear(ratio: Array, places: Array, reach: int) -> None:
     row, column = np.nonzero(np.isfinite(places))
     near = np.round(places[row, column]).astype(int)[:, None] + np.arange(-reach, reach + 1)
     ratio[row[:, None], np.clip(near, 0, ratio.shape[1] - 1)] = 0.0
+
+
+def find_changes(left: Left, parameters: Array) -> tuple[Array, Array]:
+    """Return test statistics for changes of the tones within each window, two arrays of shape (R, n).
+
+    The first is the largest reduction of the sum of squares of the whitened residual by a change of phase and amplitude
+    at one instant, in units of the noise. The variance of the partial sums of a demodulated noise residual is reduced
+    by the fitted polynomials (phase 1, u, u^2; amplitude 1, u). The second is the sum of the demodulated residual's
+    quadrature times ``P3(u)``. ``parameters`` are NaN for a missing tone, shape (R, n, 5).
+    """
+    length = left.white.shape[1]
+    begin, u = max(1, int(c.ENDS * length)), np.linspace(-1.0, 1.0, length)
+    # Integrals of the orthonormal Legendre polynomials from -1 to v, squared.
+    x = np.arange(1, length + 1) / length
+    v = 2.0 * x - 1.0
+    of_amplitude = length * (x - x**2 - 3.0 * (0.25 * (v**2 - 1.0)) ** 2)
+    of_phase = of_amplitude - length * 5.0 * (0.25 * (v**3 - v)) ** 2
+    inside = slice(begin, length - begin)
+    energy, cube = np.full((2, *parameters.shape[:2]), np.nan)
+    for k in range(parameters.shape[1]):
+        rows = np.flatnonzero(np.isfinite(parameters[:, k, 3]))
+        cosine, sine, _, turn, bend = parameters[rows, k].T
+        lags = np.arange(left.filters.shape[1])
+        response = (left.filters[rows] * np.exp(-2j * np.outer(turn, lags) / (length - 1))).sum(axis=1)
+        phase = np.angle(response) - np.arctan2(sine, cosine)
+        turned = left.white[rows] * np.exp(-1j * (phase[:, None] + np.outer(turn, u) + np.outer(bend, u**2)))
+        sums = np.cumsum(turned, axis=1)[:, inside]
+        energy[rows, k] = (sums.real**2 / of_amplitude[inside] + sums.imag**2 / of_phase[inside]).max(axis=1)
+        cube[rows, k] = turned.imag @ (0.5 * (5.0 * u**2 - 3.0) * u)
+    return energy, cube

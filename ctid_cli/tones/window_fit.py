@@ -7,8 +7,9 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.processors import in_threads
 from ctid_cli.tones import constants as c
-from ctid_cli.tones.find import Left, Lines, new_lines, spectrum_of, strongest_lines, whiten
-from ctid_cli.tones.tone_kernels import PARAMETERS, find_changes, fit_windows
+from ctid_cli.tones.find import Left, Lines, find_changes, new_lines, spectrum_of, strongest_lines, whiten
+from ctid_cli.tones.least_squares import Fits, covariances_of, fit_windows
+from ctid_cli.tones.tone_kernels import PARAMETERS, normal_equations
 
 
 class WindowTones(NamedTuple):
@@ -42,16 +43,6 @@ class WindowTones(NamedTuple):
     line: Array
     line_energy: Array
     #: Whether the iterations reached a minimum, shape (R,).
-    converged: BoolArray
-
-
-class _Fits(NamedTuple):
-    """Windows and the parameters of their tones, modified by the compiled fit."""
-
-    first: IndexArray
-    used: IndexArray
-    parameters: Array
-    covariances: Array
     converged: BoolArray
 
 
@@ -98,13 +89,13 @@ def fit_steady(samples: Array) -> WindowTones | None:
     A fit that does not converge quickly is also None.
     """
     length = samples.size
-    fits, tests, residuals = _fitted(samples, length, np.zeros(1, np.int64), _STEADY, None)
+    fits, tests = _fitted(samples, length, np.zeros(1, np.int64), _STEADY, None)
     unexplained = (tests.lines.chance < c.LEVEL) | ~fits.converged
     if unexplained.any() or not fits.used.any():
         return None
-    shorter = length // c.STEADY_STEP
+    residual, shorter = _equations(samples, length, fits)[3][0], length // c.STEADY_STEP
     while shorter >= c.SHORTEST:
-        parts = residuals[0, : length // shorter * shorter].reshape(-1, shorter)
+        parts = residual[: length // shorter * shorter].reshape(-1, shorter)
         together = max(1, c.BLOCK_SAMPLES // shorter)
         for begin in range(0, len(parts), together):
             some = parts[begin : begin + together]
@@ -112,31 +103,31 @@ def fit_steady(samples: Array) -> WindowTones | None:
             if (strongest_lines(left, spectrum_of(left.white)).chance < c.LEVEL / len(parts)).any():
                 return None
         shorter //= c.STEADY_STEP
-    return _tones(fits, tests, length)
+    return _tones(samples, length, fits, tests)
 
 
 def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: WindowTones | None) -> WindowTones:
-    fits, tests, _ = _fitted(samples, length, first, _Limits(most, most, c.MOST_STEPS), shorter)
-    return _tones(fits, tests, length)
+    fits, tests = _fitted(samples, length, first, _Limits(most, most, c.MOST_STEPS), shorter)
+    return _tones(samples, length, fits, tests)
 
 
 def _fitted(
     samples: Array, length: int, first: IndexArray, limits: _Limits, shorter: WindowTones | None
-) -> tuple[_Fits, _Tests, Array]:
-    """Return fits, tests of their residuals, and the residuals, shape (R, L)."""
-    most = limits.lines
-    rows, shape = first.size, (first.size, most, PARAMETERS)
-    fits = _Fits(
-        first, np.zeros(rows, np.int64), np.zeros(shape), np.zeros((*shape, PARAMETERS)), np.zeros(rows, np.bool_)
-    )
+) -> tuple[Fits, _Tests]:
+    """Return fits and tests of their residuals."""
+    windows = np.lib.stride_tricks.sliding_window_view(samples, length)[first]
+    there = np.isfinite(windows)
+    count = there.sum(axis=1)
+    means = np.where(there, windows, 0.0).sum(axis=1) / np.maximum(count, 1)
+    used, tones = np.zeros(first.size, np.int64), np.zeros((first.size, limits.lines, PARAMETERS))
+    fits = Fits(first, count, used, tones, means, np.zeros(first.size, np.bool_))
     if shorter is not None:
         _start(fits, length, shorter)
-    residuals = np.empty((rows, length))
     tests: _Tests | None = None
-    todo = np.arange(rows)
+    todo = np.arange(first.size)
     for round_ in range(limits.rounds + 1):
-        fit_windows(samples, length, first, todo, limits.steps, *fits[1:], residuals)
-        new = _tested(residuals[todo], fits, todo)
+        fit_windows(samples, length, fits, todo, limits.steps)
+        new = _tested(samples, length, Fits._make(each[todo] for each in fits))
         tests = new if tests is None else _replaced(tests, todo, new)
         if round_ == limits.rounds:
             break
@@ -148,7 +139,7 @@ def _fitted(
         if not todo.size:
             break
     assert tests is not None
-    return fits, tests, residuals
+    return fits, tests
 
 
 def nearest(middles: Array, places: Array) -> IndexArray:
@@ -156,7 +147,7 @@ def nearest(middles: Array, places: Array) -> IndexArray:
     return np.asarray(np.searchsorted(0.5 * (middles[1:] + middles[:-1]), places))
 
 
-def _start(fits: _Fits, length: int, shorter: WindowTones) -> None:
+def _start(fits: Fits, length: int, shorter: WindowTones) -> None:
     """Start from the significant tones of the nearest shorter windows, if these fits passed all tests."""
     half = 0.5 * (length - 1)
     middle: Array = np.asarray(fits.first + half, dtype=np.float64)
@@ -172,7 +163,7 @@ def _start(fits: _Fits, length: int, shorter: WindowTones) -> None:
         fits.used[rows] += 1
 
 
-def _join(fits: _Fits, rows: IndexArray, turns: Array) -> BoolArray:
+def _join(fits: Fits, rows: IndexArray, turns: Array) -> BoolArray:
     """Add a line to each window that has a candidate and room for it; return the mask of these windows."""
     fits_in: BoolArray = np.isfinite(turns) & (fits.used[rows] < fits.parameters.shape[1])
     rows, turns = rows[fits_in], turns[fits_in]
@@ -182,15 +173,24 @@ def _join(fits: _Fits, rows: IndexArray, turns: Array) -> BoolArray:
     return fits_in
 
 
-def _tested(residuals: Array, fits: _Fits, rows: IndexArray) -> _Tests:
-    left = whiten(residuals, PARAMETERS * fits.used[rows] + 1)
-    change, cube = np.full((2, rows.size, fits.parameters.shape[1]), np.nan)
-    find_changes(left.white, left.filters, fits.parameters[rows], fits.used[rows], change, cube)
+def _equations(samples: Array, length: int, fits: Fits) -> tuple[Array, Array, Array, Array]:
+    """Return the costs, gradients, normal matrices and residuals of fits."""
+    tones = np.ascontiguousarray(fits.parameters[:, : fits.used.max()])
+    return normal_equations(samples, length, fits.first, fits.used, tones, fits.constants)
+
+
+def _tested(samples: Array, length: int, fits: Fits) -> _Tests:
+    """Test the residuals of fits for lines and changes."""
+    half = 0.5 * (length - 1)
+    left = whiten(_equations(samples, length, fits)[3], PARAMETERS * fits.used + 1)
+    empty = np.arange(fits.parameters.shape[1]) >= fits.used[:, None]
+    parameters = np.where(empty[:, :, None], np.nan, fits.parameters)
+    change, cube = find_changes(left, parameters)
     spectrum = spectrum_of(left.white)
-    half = 0.5 * (residuals.shape[1] - 1)
-    empty = np.arange(change.shape[1]) >= fits.used[rows, None]
-    joining = new_lines(left, spectrum, np.where(empty, np.nan, fits.parameters[rows, :, 3] / half), change)
-    return _Tests(left._replace(white=np.empty((rows.size, 0))), strongest_lines(left, spectrum), change, cube, joining)
+    joining = new_lines(left, spectrum, parameters[:, :, 3] / half, change)
+    return _Tests(
+        left._replace(white=np.empty((len(empty), 0))), strongest_lines(left, spectrum), change, cube, joining
+    )
 
 
 def _replaced(old: _Tests, rows: IndexArray, new: _Tests) -> _Tests:
@@ -201,7 +201,7 @@ def _replaced(old: _Tests, rows: IndexArray, new: _Tests) -> _Tests:
     return old
 
 
-def _tones(fits: _Fits, tests: _Tests, length: int) -> WindowTones:
+def _tones(samples: Array, length: int, fits: Fits, tests: _Tests) -> WindowTones:
     """Convert parameters to units per sample, with standard errors from the noise near each tone."""
     half = 0.5 * (length - 1)
     empty = np.arange(fits.parameters.shape[1]) >= fits.used[:, None]
@@ -209,7 +209,9 @@ def _tones(fits: _Fits, tests: _Tests, length: int) -> WindowTones:
     noise = np.where(empty, np.nan, tests.left.noise(np.where(empty, 0.0, turn / half)))
     amplitude = np.hypot(cosine, sine)
     with np.errstate(invalid="ignore", divide="ignore"):
-        covariances = noise[:, :, None, None] * fits.covariances
+        inverses = covariances_of(_equations(samples, length, fits)[2], fits.used)
+        covariances = np.full((*noise.shape, PARAMETERS, PARAMETERS), np.nan)
+        covariances[:, : inverses.shape[1]] = noise[:, : inverses.shape[1], None, None] * inverses
         errors = np.sqrt(np.diagonal(covariances, axis1=2, axis2=3))
         # Gradient of the logarithm of the amplitude with respect to both amplitudes.
         weights = np.stack((cosine, sine), axis=2) / amplitude[:, :, None] ** 2

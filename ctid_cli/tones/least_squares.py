@@ -1,0 +1,115 @@
+"""Least-squares fits of sums of decaying chirps to windows of one length, all windows together."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray, IndexArray
+from ctid_cli.tones.tone_kernels import PARAMETERS, normal_equations
+
+#: Number of free parameters of each tone and most steps of each stage: amplitudes first, curvature last.
+STAGES = ((2, 1), (4, 4), (PARAMETERS, 60))
+#: Largest values of the parameters: growth of the logarithm of the amplitude, and quadratic phase, over half a window.
+BOUNDS = np.array([np.inf, np.inf, 4.0, np.inf, 1e4])
+#: A stage ends when a step would lower the sum of squares by less than this share of one sample's, or changes no
+#: phase by more than this [rad] and no amplitude by more than this share.
+SMALL_GAIN = 1e-3
+SMALL_STEP = 1e-9
+#: Longest step of a phase over half a window [rad]; longer ones may end in another local minimum.
+LONGEST_STEP = 2.0
+#: Marquardt's damping in units of the diagonal: first value, factors, and largest value.
+DAMPING = 1e-4
+RAISED = 10.0
+LOWERED = 0.1
+LEAST_DAMPING = 1e-12
+MOST_DAMPING = 1e6
+#: Added to the diagonal before a covariance is computed, as a share of it.
+RIDGE = 1e-13
+
+
+class Fits(NamedTuple):
+    """Windows and their tones, modified in place."""
+
+    #: First sample, number of present samples, and number of tones of each window, shape (R,).
+    first: IndexArray
+    present: IndexArray
+    used: IndexArray
+    #: Parameters of the tones, shape (R, n, 5), and the constant of each window, shape (R,).
+    parameters: Array
+    constants: Array
+    #: Whether the iterations reached a minimum, shape (R,).
+    converged: BoolArray
+
+
+def fit_windows(samples: Array, length: int, fits: Fits, chosen: IndexArray, most_steps: int) -> None:
+    """Fit the tones of the windows ``chosen`` by Levenberg-Marquardt steps; a stage takes at most ``most_steps``."""
+    fits.converged[chosen] = False
+    chosen = chosen[fits.present[chosen] > PARAMETERS * fits.used[chosen] + 1]
+    if not chosen.size:
+        return
+    first, used, n = fits.first[chosen], fits.used[chosen], fits.used[chosen].max()
+    tones, constants = fits.parameters[chosen, :n], fits.constants[chosen]
+    equations = list(normal_equations(samples, length, first, used, tones, constants)[:3])
+    for stage, steps in STAGES:
+        damping, taken, done = np.full(chosen.size, DAMPING), np.zeros(chosen.size, int), np.zeros(chosen.size, bool)
+        while (rows := np.flatnonzero(~done & (taken < min(steps, most_steps)))).size:
+            costs, right, gram = (each[rows] for each in equations)
+            free = _free_parameters(tones[rows], used[rows], right, stage)
+            step = _damped_steps(gram, right, free, damping[rows])
+            moved = step[:, 1:].reshape(rows.size, n, PARAMETERS)
+            trial = np.clip(tones[rows] + moved, -BOUNDS, BOUNDS)
+            moved = np.abs(trial - tones[rows])
+            turned = moved[:, :, 2:].max(axis=(1, 2), initial=0.0)
+            height = np.hypot(tones[rows, :, 0], tones[rows, :, 1])
+            still = (moved[:, :, :2] <= SMALL_STEP * height[:, :, None]).all(axis=(1, 2)) & (turned <= SMALL_STEP)
+            gain = (step * right).sum(axis=1)
+            small = (gain <= SMALL_GAIN * costs / fits.present[chosen[rows]]) | still
+            done[rows] = ((gain >= 0.0) & small) | (damping[rows] > MOST_DAMPING)
+            tried = ~done[rows] & (turned < LONGEST_STEP)
+            damping[rows] *= RAISED
+            if not tried.any():
+                continue
+            rows, trial, levels = rows[tried], trial[tried], constants[rows[tried]] + step[tried, 0]
+            new = normal_equations(samples, length, first[rows], used[rows], trial, levels)
+            lower = new[0] <= equations[0][rows]
+            rows = rows[lower]
+            tones[rows], constants[rows] = trial[lower], levels[lower]
+            for values, each in zip(equations, new, strict=False):
+                values[rows] = each[lower]
+            damping[rows] = np.maximum(damping[rows] * LOWERED / RAISED, LEAST_DAMPING)
+            taken[rows] += 1
+    fits.parameters[chosen, :n], fits.constants[chosen], fits.converged[chosen] = tones, constants, done
+
+
+def _free_parameters(tones: Array, used: IndexArray, right: Array, stage: int) -> BoolArray:
+    """Return the free parameters of a stage and the constant, except those that a step would move out of bounds."""
+    slopes = right[:, 1:].reshape(tones.shape)
+    free = (np.abs(tones) < BOUNDS) | (tones * slopes < 0.0)
+    free &= (np.arange(PARAMETERS) < stage) & (np.arange(tones.shape[1]) < used[:, None])[:, :, None]
+    return np.concatenate((np.ones((used.size, 1), bool), free.reshape(used.size, -1)), axis=1)
+
+
+def _damped_steps(gram: Array, right: Array, free: BoolArray, damping: Array) -> Array:
+    """Solve normal equations scaled to a unit diagonal; the step of a parameter that is not free is zero."""
+    matrix, scales = _scaled(gram, free, damping)
+    return np.asarray(np.linalg.solve(matrix, np.where(free, right / scales, 0.0)[:, :, None])[:, :, 0] / scales)
+
+
+def _scaled(gram: Array, free: BoolArray, added: Array) -> tuple[Array, Array]:
+    """Return normal matrices of the free parameters with a unit diagonal increased by ``added``, and their scales."""
+    squares = np.einsum("rii->ri", gram)
+    scales = np.sqrt(np.where(free & (squares > 0.0), squares, 1.0))
+    weights = free / scales
+    matrix = gram * weights[:, :, None] * weights[:, None, :]
+    np.einsum("rii->ri", matrix)[:] = 1.0 + added[:, None]
+    return matrix, scales
+
+
+def covariances_of(gram: Array, used: IndexArray) -> Array:
+    """Return the blocks of the inverse normal matrices that belong to one tone each, shape (R, n, 5, 5)."""
+    n = gram.shape[1] // PARAMETERS
+    free = np.arange(gram.shape[1]) <= PARAMETERS * used[:, None]
+    matrix, scales = _scaled(gram, free, np.full(used.size, RIDGE))
+    inverse = np.linalg.inv(matrix) / (scales[:, :, None] * scales[:, None, :])
+    blocks = inverse[:, 1:, 1:].reshape(used.size, n, PARAMETERS, n, PARAMETERS)
+    return np.asarray(np.einsum("rkakb->rkab", blocks))
