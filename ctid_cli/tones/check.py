@@ -107,20 +107,13 @@ def _error_at(x: Array, error: Array, covariance: Array, slope_error: Array) -> 
 
 
 def _leaked(tones: WindowTones, length: int) -> Array:
-    """Return the energy of the residual lines and changes at each tone, in units of the noise, shape (R, n).
+    """Return the energy of the residual line at each tone, in units of the noise, shape (R, n).
 
     It is infinite for a line within the width of the tone.
     """
-    bins = length / (2.0 * np.pi)
-    away = np.abs(tones.omega - tones.line[:, None]) * bins
+    away = np.abs(tones.omega - tones.line[:, None]) * length / (2.0 * np.pi)
     line = np.where(tones.line_chance < c.LEVEL, tones.line_energy, 0.0)[:, None]
-    leaked = np.where((line > 0.0) & (away < c.APART), np.inf, line / np.maximum(away, c.APART) ** 2)
-    changed = np.where(tones.change_chance < c.LEVEL, tones.change_energy, 0.0)
-    for j in np.flatnonzero(changed.any(axis=0)):
-        away = np.maximum(np.abs(tones.omega - tones.omega[:, j, None]) * bins, c.SMALLEST_FLOOR)
-        away[:, j] = np.inf
-        leaked = np.fmax(leaked, changed[:, j, None] / away**2)
-    return np.asarray(leaked)
+    return np.asarray(np.where((line > 0.0) & (away < c.APART), np.inf, line / np.maximum(away, c.APART) ** 2))
 
 
 def _raised(tones: WindowTones, length: int) -> Array:
@@ -128,21 +121,13 @@ def _raised(tones: WindowTones, length: int) -> Array:
     own = c.STEP**2 * np.where(tones.change_chance < c.DOUBTFUL, tones.change_energy, 0.0)
     changed = tones.change_chance < c.LEVEL
     own[changed] = c.KINKED**2 * tones.change_energy[changed]
-    own[changed & (tones.change_energy > c.SMALL_CHANGE * _energy(tones))] = np.inf
     return np.asarray(np.sqrt(1.0 + (own + c.LEAKAGE**2 * _leaked(tones, length)) / c.COVERED**2))
-
-
-def _energy(tones: WindowTones) -> Array:
-    """Return the energy of tones in units of the noise, shape (R, n)."""
-    return 0.5 * (tones.amplitude / tones.amplitude_error) ** 2
 
 
 def _sound(tones: WindowTones, length: int) -> BoolArray:
     """Return which tones are not disturbed by the residual of their window, shape (R, n)."""
-    sound = np.isfinite(tones.omega_error) & tones.converged[:, None] & (_raised(tones, length) < c.MOST_RAISED)
-    full = np.isfinite(tones.omega).all(axis=1, keepdims=True)
-    line = np.where(tones.line_chance < c.LEVEL, tones.line_energy, 0.0)[:, None]
-    return np.asarray(sound & ~(full & (line > c.COMPARABLE * _energy(tones))))
+    sound = np.isfinite(tones.omega_error) & tones.converged[:, None]
+    return np.asarray(sound & (_raised(tones, length) < c.MOST_RAISED))
 
 
 def explained(tones: WindowTones, length: int) -> bool:
@@ -205,8 +190,4 @@ def moving(r: Readings, bounds: IndexArray) -> BoolArray:
         if shorter.any():
             best = np.where(shorter, error, np.inf).argmin()
             refuted[k] = abs(r.omega[k] - omega[best]) > c.COVERED * error[best]
-    if not refuted.any():
-        return refuted
-    line = np.unique(np.column_stack((r.window, r.middle, r.tone)), axis=0, return_inverse=True)[1].ravel()
-    share: Array = np.bincount(line, refuted) / np.bincount(line)
-    return np.asarray(refuted | (share[line] > c.REFUTED))
+    return refuted

@@ -62,18 +62,14 @@ PADDING = 2
 #: variables: the median has the variance 1/n, over ln(2)^2.
 FLOOR_BINS = 101
 MEDIAN_EFFICIENCY = 0.48
-#: Whitening model: highest order, samples per coefficient, rounds, and ratio to the noise floor at which ordinates are
-#: clipped before (noise exceeds it in 1 of 150).
+#: Whitening model: highest order, samples per coefficient, and ratio to the noise floor at which ordinates are clipped
+#: before (noise exceeds it in 1 of 150).
 WHITENING_ORDER = 4
 SAMPLES_PER_ORDER = 128
-WHITENING_ROUNDS = 2
 CUT = 5.0
 #: Smallest divisors.
 SMALLEST_FLOOR = 1e-300
-SMALLEST_GAIN = 1e-12
 LEAST_NOISE = 1e-6
-#: Ratio of a tapered spectrum to its noise floor that shows a line in noise of any colour. Measured.
-LINE_HEIGHT = 2e4
 #: Independent ordinates of a padded periodogram per sample, measured on white noise.
 INDEPENDENT = 0.8
 #: Significance level per window of the tests for lines and changes.
@@ -99,8 +95,6 @@ HOPS = 2
 SAMPLES_PER_PARAMETER = 3
 #: A line closer to a tone than this number of bins is a change of it, or a tone that the window does not resolve.
 APART = 1.5
-#: Least amplitude, in standard errors, of a tone in shorter windows that starts the fit of a longer one.
-SURE = 6.0
 #: Largest number of steps of a stage of a fit. A record of few steady tones is fitted as a whole, in few rounds of few
 #: steps: this takes a tenth of the time of windows of all lengths. Its residual is tested for lines in windows that are
 #: shorter by STEADY_STEP each.
@@ -119,8 +113,6 @@ BLOCK_SAMPLES = 2**16
 LEAKAGE = 0.78
 #: Largest ratio of the error of a reading to that of its fit; readings beyond it are not used.
 MOST_RAISED = 20.0
-#: A full window gives no reading of a tone if its residual has a line of more than this share of the tone's energy.
-COMPARABLE = 0.1
 #: Lines of one window closer than this number of bins may be one tone that changes. Measured.
 RESOLVED = 1.7
 #: Fewest periods of a tone in a window, and its least amplitude in standard errors.
@@ -137,12 +129,10 @@ KINK = 0.27
 HIDDEN_KINK = 18.0
 #: A change of energy E shifts the frequency by at most these multiples of sqrt(E) standard errors: the largest ratios
 #: for a step of phase anywhere in the window, and for one of frequency in its middle, computed without noise. A change
-#: with a p-value below DOUBTFUL is possible, and at most a step of phase. One above the share SMALL_CHANGE of the
-#: tone's energy may be of any kind.
+#: with a p-value below DOUBTFUL is possible, and at most a step of phase.
 STEP = 2.8
 KINKED = 18.1
 DOUBTFUL = 0.1
-SMALL_CHANGE = 0.005
 #: Two unresolved tones may look like one whose growth exceeds GROWS errors but not BLENDED_GROWTH over half a window;
 #: they bias its frequency by at most its growth [rad/sample].
 GROWS = 2.0
@@ -158,8 +148,6 @@ EQUAL_ERRORS = 5.0
 MOST_APART = 4
 BESIDE = 3.0
 HARMONIC = 0.2
-#: A line of a comb that shorter windows reject at more than this share of the rows is rejected at all rows.
-REFUTED = 0.25
 
 # --- tones over time ------------------------------------------------------------------------------------------------
 
@@ -171,12 +159,8 @@ GATE_ERRORS = 5.0
 GATE_BINS = 1.0
 #: A tone ends after more rows without readings than this, and than one of its windows.
 PATIENCE = 3
-#: A tone that ends and one that begins later are one tone if their relative frequency difference is below LARGEST_JUMP;
-#: a pause as long as the record adds PAUSE.
+#: A tone that ends and one that begins later are one tone if their relative frequency difference is smaller.
 LARGEST_JUMP = 0.25
-PAUSE = 0.25
-#: Relative standard error of the frequency that a tone must reach at some row.
-COARSE = 0.01
 
 # --- residual of a track --------------------------------------------------------------------------------------------
 

@@ -69,14 +69,12 @@ class _Tests(NamedTuple):
     joining: Array
 
 
-def fit_tones(
-    samples: Array, length: int, first: IndexArray, most: int, shorter: WindowTones | None = None
-) -> WindowTones:
-    """Fit the tones of windows of one length, starting from those of shorter windows."""
+def fit_tones(samples: Array, length: int, first: IndexArray, most: int) -> WindowTones:
+    """Fit the tones of windows of one length."""
     most = max(1, min(most, (length // c.SAMPLES_PER_PARAMETER - 1) // PARAMETERS))
     size = max(1, c.BLOCK_SAMPLES // length)
     parts = [first[k : k + size] for k in range(0, first.size, size)]
-    blocks = in_threads(lambda part: _block(samples, length, part, most, shorter), parts)
+    blocks = in_threads(lambda part: _block(samples, length, part, most), parts)
     tones = WindowTones(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
     # One empty column is kept if possible: windows without one are full.
     kept = int(np.isfinite(tones.omega).sum(axis=1).max()) + 1
@@ -89,7 +87,7 @@ def fit_steady(samples: Array) -> WindowTones | None:
     A fit that does not converge quickly is also None.
     """
     length = samples.size
-    fits, tests = _fitted(samples, length, np.zeros(1, np.int64), _STEADY, None)
+    fits, tests = _fitted(samples, length, np.zeros(1, np.int64), _STEADY)
     unexplained = (tests.lines.chance < c.LEVEL) | ~fits.converged
     if unexplained.any() or not fits.used.any():
         return None
@@ -100,20 +98,18 @@ def fit_steady(samples: Array) -> WindowTones | None:
         for begin in range(0, len(parts), together):
             some = parts[begin : begin + together]
             left = whiten(some, np.zeros(len(some), np.int64))
-            if (strongest_lines(left, spectrum_of(left.white)).chance < c.LEVEL / len(parts)).any():
+            if (strongest_lines(spectrum_of(left.white)).chance < c.LEVEL / len(parts)).any():
                 return None
         shorter //= c.STEADY_STEP
     return _tones(samples, length, fits, tests)
 
 
-def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: WindowTones | None) -> WindowTones:
-    fits, tests = _fitted(samples, length, first, _Limits(most, most, c.MOST_STEPS), shorter)
+def _block(samples: Array, length: int, first: IndexArray, most: int) -> WindowTones:
+    fits, tests = _fitted(samples, length, first, _Limits(most, most, c.MOST_STEPS))
     return _tones(samples, length, fits, tests)
 
 
-def _fitted(
-    samples: Array, length: int, first: IndexArray, limits: _Limits, shorter: WindowTones | None
-) -> tuple[Fits, _Tests]:
+def _fitted(samples: Array, length: int, first: IndexArray, limits: _Limits) -> tuple[Fits, _Tests]:
     """Return fits and tests of their residuals."""
     windows = np.lib.stride_tricks.sliding_window_view(samples, length)[first]
     there = np.isfinite(windows)
@@ -121,8 +117,6 @@ def _fitted(
     means = np.where(there, windows, 0.0).sum(axis=1) / np.maximum(count, 1)
     used, tones = np.zeros(first.size, np.int64), np.zeros((first.size, limits.lines, PARAMETERS))
     fits = Fits(first, count, used, tones, means, np.zeros(first.size, np.bool_))
-    if shorter is not None:
-        _start(fits, length, shorter)
     tests: _Tests | None = None
     todo = np.arange(first.size)
     for round_ in range(limits.rounds + 1):
@@ -140,27 +134,6 @@ def _fitted(
             break
     assert tests is not None
     return fits, tests
-
-
-def nearest(middles: Array, places: Array) -> IndexArray:
-    """Return the index of the nearest of the ascending ``middles`` for each place."""
-    return np.asarray(np.searchsorted(0.5 * (middles[1:] + middles[:-1]), places))
-
-
-def _start(fits: Fits, length: int, shorter: WindowTones) -> None:
-    """Start from the significant tones of the nearest shorter windows, if these fits passed all tests."""
-    half = 0.5 * (length - 1)
-    middle: Array = np.asarray(fits.first + half, dtype=np.float64)
-    beginning = nearest(shorter.middle, middle)
-    clean = shorter.converged & (shorter.line_chance >= c.LEVEL) & ~(shorter.change_chance < c.LEVEL).any(axis=1)
-    sure = clean[:, None] & (shorter.amplitude > c.SURE * shorter.amplitude_error)
-    for j in range(min(shorter.omega.shape[1], fits.parameters.shape[1])):
-        rows = np.flatnonzero(sure[beginning, j])
-        of, place = beginning[rows], fits.used[rows]
-        omega = shorter.omega[of, j] + shorter.rate[of, j] * (middle[rows] - shorter.middle[of])
-        fits.parameters[rows, place, 3] = omega * half
-        fits.parameters[rows, place, 4] = 0.5 * shorter.rate[of, j] * half**2
-        fits.used[rows] += 1
 
 
 def _join(fits: Fits, rows: IndexArray, turns: Array) -> BoolArray:
@@ -187,10 +160,8 @@ def _tested(samples: Array, length: int, fits: Fits) -> _Tests:
     parameters = np.where(empty[:, :, None], np.nan, fits.parameters)
     change, cube = find_changes(left, parameters)
     spectrum = spectrum_of(left.white)
-    joining = new_lines(left, spectrum, parameters[:, :, 3] / half, change)
-    return _Tests(
-        left._replace(white=np.empty((len(empty), 0))), strongest_lines(left, spectrum), change, cube, joining
-    )
+    joining = new_lines(spectrum, parameters[:, :, 3] / half, change)
+    return _Tests(left._replace(white=np.empty((len(empty), 0))), strongest_lines(spectrum), change, cube, joining)
 
 
 def _replaced(old: _Tests, rows: IndexArray, new: _Tests) -> _Tests:
