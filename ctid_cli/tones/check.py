@@ -190,4 +190,8 @@ def moving(r: Readings, bounds: IndexArray) -> BoolArray:
         if shorter.any():
             best = np.where(shorter, error, np.inf).argmin()
             refuted[k] = abs(r.omega[k] - omega[best]) > c.COVERED * error[best]
-    return refuted
+    if not refuted.any():
+        return refuted
+    line = np.unique(np.column_stack((r.window, r.middle, r.tone)), axis=0, return_inverse=True)[1].ravel()
+    share: Array = np.bincount(line, refuted) / np.bincount(line)
+    return np.asarray(refuted | (share[line] > c.REFUTED))

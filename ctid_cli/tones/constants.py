@@ -148,6 +148,8 @@ EQUAL_ERRORS = 5.0
 MOST_APART = 4
 BESIDE = 3.0
 HARMONIC = 0.2
+#: A line of a comb that shorter windows reject at more than this share of the rows is rejected at all rows.
+REFUTED = 0.25
 
 # --- tones over time ------------------------------------------------------------------------------------------------
 

@@ -31,8 +31,9 @@ def readings_at(
     found = Readings(*(np.concatenate(each) for each in zip(*parts[::-1], strict=True)))
     found = found.at(np.argsort(found.row, kind="stable"))
     bounds = np.searchsorted(found.row, np.arange(places.size + 1))
-    table: Array = np.stack((found.omega, found.error, found.window, found.middle))
-    kept = keep_readings(table, bounds, c.SAME_BINS, c.SAME_ERRORS, moving(found, bounds))
+    relative = found.amplitude_error / found.amplitude
+    table: Array = np.stack((found.omega, found.error, relative, found.window, found.middle))
+    kept = keep_readings(table, bounds, c.SAME_BINS, c.SAME_ERRORS, c.COVERED, moving(found, bounds))
     found = found.at(np.flatnonzero(kept))
     return found.at(np.lexsort((found.omega, found.row)))
 

@@ -127,19 +127,29 @@ def normal_equations(
 
 
 @njit(cache=True, nogil=True)
-def keep_readings(readings: Array, bounds: IndexArray, reach: float, errors: float, closed: BoolArray) -> BoolArray:
+def keep_readings(
+    readings: Array, bounds: IndexArray, reach: float, errors: float, agree: float, closed: BoolArray
+) -> BoolArray:
     """Return which readings of each instant are kept: none that is close to one of a longer, or nearer, window.
 
-    ``readings``, shape (4, N), are frequencies, their errors, windows and their middles. Readings of one window are of
-    different tones.
+    ``readings``, shape (5, N), are frequencies, their errors, relative errors of amplitudes, windows and their middles.
+    Readings of one window are of different tones. If the residual of the longest window masks a tone, so that a
+    shorter one that agrees has half the relative error and a smaller standard error, the shorter one is kept.
     """
-    omega, error, window, middle = readings
+    omega, error, unclear, window, middle = readings
+    kept = np.zeros(omega.size, np.bool_)
     for row in range(bounds.size - 1):
         for first in range(bounds[row], bounds[row + 1]):
             if closed[first]:
                 continue
+            best = first
             for k in range(first + 1, bounds[row + 1]):
-                if window[k] != window[first] or middle[k] != middle[first]:
-                    near = max(reach * 2.0 * math.pi / window[k], errors * math.hypot(error[k], error[first]))
-                    closed[k] = closed[k] or abs(omega[k] - omega[first]) < near
-    return ~closed
+                if closed[k] or (window[k] == window[first] and middle[k] == middle[first]):
+                    continue
+                off = abs(omega[k] - omega[first])
+                sure = math.hypot(error[k], error[first])
+                closed[k] = off < max(reach * 2.0 * math.pi / window[k], errors * sure)
+                if off <= agree * sure and 2.0 * unclear[k] < unclear[first] and error[k] < error[best]:
+                    best = k
+            kept[best] = True
+    return kept
