@@ -157,25 +157,20 @@ def _combs(tones: WindowTones) -> tuple[Array, Array, Array]:
     if tones.omega.shape[1] < c.COMB:
         return gap, low, high
     order = np.argsort(tones.omega, axis=1)
-    omega, error = (np.take_along_axis(each, order, axis=1) for each in (tones.omega, tones.omega_error))
-    steps, sure = np.diff(omega, axis=1), np.hypot(error[:, 1:], error[:, :-1])
-    allowed = np.maximum(c.EQUAL_ERRORS * np.maximum(sure[:, 1:], sure[:, :-1]), c.UNEQUAL * steps[:, :-1])
-    equal = (np.abs(np.diff(steps, axis=1)) <= allowed) & (steps[:, :-1] < c.HARMONIC * omega[:, :-2])
+    omega = np.take_along_axis(tones.omega, order, axis=1)
+    steps = np.diff(omega, axis=1)
+    equal = np.abs(np.diff(steps, axis=1)) <= c.UNEQUAL * steps[:, :-1]
+    equal &= steps[:, :-1] < c.HARMONIC * omega[:, :-2]
     for row, k in np.argwhere(equal):
+        middle, base = omega[row, k + 1], steps[row, k]
         if gap[row, order[row, k + 1]] > 0.0:
             continue
-        # All lines at multiples of the spacing belong to the comb, unless too many are missing between them.
-        base = steps[row, k]
-        away = (omega[row] - omega[row, k + 1]) / base
-        lines = np.sort(np.round(away[np.abs(away - np.round(away)) <= c.UNEQUAL * np.maximum(1.0, np.abs(away))]))
-        breaks = np.flatnonzero(np.diff(lines) > c.MOST_APART)
-        begin = np.searchsorted(breaks, np.searchsorted(lines, 0.0))
-        first = lines[breaks[begin - 1] + 1] if begin > 0 else lines[0]
-        last = lines[breaks[begin]] if begin < breaks.size else lines[-1]
-        inside = order[row, (away > first - c.BESIDE) & (away < last + c.BESIDE)]
-        gap[row, inside] = base
-        low[row, inside] = omega[row, k + 1] + (first - c.BESIDE) * base
-        high[row, inside] = omega[row, k + 1] + (last + c.BESIDE) * base
+        # All lines at multiples of the spacing belong to the comb.
+        away = (omega[row] - middle) / base
+        lines = np.round(away[np.abs(away - np.round(away)) <= c.UNEQUAL * np.maximum(1.0, np.abs(away))])
+        bottom, top = middle + base * (lines.min() - c.BESIDE), middle + base * (lines.max() + c.BESIDE)
+        inside = order[row, (bottom < omega[row]) & (omega[row] < top)]
+        gap[row, inside], low[row, inside], high[row, inside] = base, bottom, top
     return gap, low, high
 
 

@@ -139,13 +139,11 @@ GROWS = 2.0
 BLENDED_GROWTH = 1.0
 #: Standard errors that must cover a bias: biases are divided by this number.
 COVERED = 3.0
-#: COMB or more lines with spacings equal within the share UNEQUAL, or EQUAL_ERRORS, may be one modulated tone. Adjacent
-#: lines of the comb are at most MOST_APART spacings apart; lines within BESIDE spacings of its ends belong to it.
-#: Spacings above the share HARMONIC of the frequency are those of harmonics.
+#: COMB or more lines with spacings equal within the share UNEQUAL may be one modulated tone. Lines
+#: within BESIDE spacings of its ends belong to it. Spacings above the share HARMONIC of the frequency are those of
+#: harmonics.
 COMB = 3
 UNEQUAL = 0.05
-EQUAL_ERRORS = 5.0
-MOST_APART = 4
 BESIDE = 3.0
 HARMONIC = 0.2
 #: A line of a comb that shorter windows reject at more than this share of the rows is rejected at all rows.
