@@ -168,7 +168,7 @@ def _combs(tones: WindowTones) -> tuple[Array, Array, Array]:
         # All lines at multiples of the spacing belong to the comb.
         away = (omega[row] - middle) / base
         lines = np.round(away[np.abs(away - np.round(away)) <= c.UNEQUAL * np.maximum(1.0, np.abs(away))])
-        bottom, top = middle + base * (lines.min() - c.BESIDE), middle + base * (lines.max() + c.BESIDE)
+        bottom, top = middle + base * (lines.min() - c.COMB_MARGIN), middle + base * (lines.max() + c.COMB_MARGIN)
         inside = order[row, (bottom < omega[row]) & (omega[row] < top)]
         gap[row, inside], low[row, inside], high[row, inside] = base, bottom, top
     return gap, low, high

@@ -40,8 +40,8 @@ def condition(samples: Array, interval: float) -> Conditioned:
     reasons = []
     if spikes.any():
         samples = np.where(spikes, np.nan, samples)
-        told = f"Spikes, {c.SPIKE_TIMES:g} times as high as all around them, are taken as missing"
-        reasons.append(f"{told}: {spikes.sum()}.")
+        treated = f"Spikes, {c.SPIKE_TIMES:g} times as high as all around them, are taken as missing"
+        reasons.append(f"{treated}: {spikes.sum()}.")
     scale = float(np.nanmax(np.abs(samples)))
     # Dither: a rounded signal has no noise from which errors could be estimated.
     samples = samples / scale + c.DITHER * np.random.default_rng(0).standard_normal(samples.size)

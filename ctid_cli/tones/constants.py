@@ -13,7 +13,7 @@ METHOD = "tone_windows"
 USUAL_ACCURACY = 0.001
 #: Largest number of tones that can be requested, and of lines in one window: 321 equations. A low guitar string has 45
 #: lines at once. Measured.
-MOST_ASKED = 64
+MOST_TONES = 64
 MOST_LINES = 64
 #: Default number of rows of a track: the resolution of a figure.
 USUAL_ROWS = 1000
@@ -139,12 +139,11 @@ GROWS = 2.0
 BLENDED_GROWTH = 1.0
 #: Standard errors that must cover a bias: biases are divided by this number.
 COVERED = 3.0
-#: COMB or more lines with spacings equal within the share UNEQUAL may be one modulated tone. Lines
-#: within BESIDE spacings of its ends belong to it. Spacings above the share HARMONIC of the frequency are those of
-#: harmonics.
+#: COMB or more lines with spacings equal within the share UNEQUAL may be one modulated tone. Lines within COMB_MARGIN
+#: spacings of its ends belong to it. Spacings above the share HARMONIC of the frequency are those of harmonics.
 COMB = 3
 UNEQUAL = 0.05
-BESIDE = 3.0
+COMB_MARGIN = 3.0
 HARMONIC = 0.2
 #: A line of a comb that shorter windows reject at more than this share of the rows is rejected at all rows.
 REFUTED = 0.25

@@ -13,7 +13,7 @@ from ctid_cli.tones.window_fit import fit_steady, fit_tones
 
 
 def readings_at(
-    samples: Array, places: Array, longest: int, tell: Callable[[int, int], None] | None = None
+    samples: Array, places: Array, longest: int, on_progress: Callable[[int, int], None] | None = None
 ) -> Readings:
     """Return the tones of a signal at ascending places [samples], each from its longest undisturbed window."""
     if longest == samples.size and (steady := fit_steady(samples)) is not None:
@@ -23,8 +23,8 @@ def readings_at(
     parts: list[Readings] = []
     lengths = [c.SHORTEST * 2**k for k in range(64) if c.SHORTEST * 2**k < longest] + [longest]
     for done, length in enumerate(lengths):
-        if tell is not None:
-            tell(done, len(lengths))
+        if on_progress is not None:
+            on_progress(done, len(lengths))
         first = _windows(length, samples.size, places)
         parts.append(readings_of(fit_tones(samples, length, first, c.MOST_LINES), length, places))
     # The longest windows first; at equal length, the one with the nearest middle.
