@@ -5,26 +5,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
+from ctid_cli.tones import constants as c
 from ctid_cli.tones.tone_kernels import PARAMETERS, normal_equations
 
-#: Number of free parameters of each tone and most steps of each stage: amplitudes first, curvature last.
-STAGES = ((2, 1), (4, 4), (PARAMETERS, 60))
-#: Largest values of the parameters: growth of the logarithm of the amplitude, and quadratic phase, over half a window.
-BOUNDS = np.array([np.inf, np.inf, 4.0, np.inf, 1e4])
-#: A stage ends when a step would lower the sum of squares by less than this share of one sample's, or changes no
-#: phase by more than this [rad] and no amplitude by more than this share.
-SMALL_GAIN = 1e-3
-SMALL_STEP = 1e-9
-#: Longest step of a phase over half a window [rad]; longer ones may end in another local minimum.
-LONGEST_STEP = 2.0
-#: Marquardt's damping in units of the diagonal: first value, factors, and largest value.
-DAMPING = 1e-4
-RAISED = 10.0
-LOWERED = 0.1
-LEAST_DAMPING = 1e-12
-MOST_DAMPING = 1e6
-#: Added to the diagonal before a covariance is computed, as a share of it.
-RIDGE = 1e-13
+BOUNDS = np.array(c.BOUNDS)
 
 
 class Fits(NamedTuple):
@@ -50,8 +34,8 @@ def fit_windows(samples: Array, length: int, fits: Fits, chosen: IndexArray, mos
     first, used, n = fits.first[chosen], fits.used[chosen], fits.used[chosen].max()
     tones, constants = fits.parameters[chosen, :n], fits.constants[chosen]
     equations = list(normal_equations(samples, length, first, used, tones, constants)[:3])
-    for stage, steps in STAGES:
-        damping, taken, done = np.full(chosen.size, DAMPING), np.zeros(chosen.size, int), np.zeros(chosen.size, bool)
+    for stage, steps in c.STAGES:
+        damping, taken, done = np.full(chosen.size, c.DAMPING), np.zeros(chosen.size, int), np.zeros(chosen.size, bool)
         while (rows := np.flatnonzero(~done & (taken < min(steps, most_steps)))).size:
             costs, right, gram = (each[rows] for each in equations)
             free = _free_parameters(tones[rows], used[rows], right, stage)
@@ -61,12 +45,12 @@ def fit_windows(samples: Array, length: int, fits: Fits, chosen: IndexArray, mos
             moved = np.abs(trial - tones[rows])
             turned = moved[:, :, 2:].max(axis=(1, 2), initial=0.0)
             height = np.hypot(tones[rows, :, 0], tones[rows, :, 1])
-            still = (moved[:, :, :2] <= SMALL_STEP * height[:, :, None]).all(axis=(1, 2)) & (turned <= SMALL_STEP)
+            still = (moved[:, :, :2] <= c.SMALL_STEP * height[:, :, None]).all(axis=(1, 2)) & (turned <= c.SMALL_STEP)
             gain = (step * right).sum(axis=1)
-            small = (gain <= SMALL_GAIN * costs / fits.present[chosen[rows]]) | still
-            done[rows] = ((gain >= 0.0) & small) | (damping[rows] > MOST_DAMPING)
-            tried = ~done[rows] & (turned < LONGEST_STEP)
-            damping[rows] *= RAISED
+            small = (gain <= c.SMALL_GAIN * costs / fits.present[chosen[rows]]) | still
+            done[rows] = ((gain >= 0.0) & small) | (damping[rows] > c.MOST_DAMPING)
+            tried = ~done[rows] & (turned < c.LONGEST_STEP)
+            damping[rows] *= c.RAISED
             if not tried.any():
                 continue
             rows, trial, levels = rows[tried], trial[tried], constants[rows[tried]] + step[tried, 0]
@@ -76,7 +60,7 @@ def fit_windows(samples: Array, length: int, fits: Fits, chosen: IndexArray, mos
             tones[rows], constants[rows] = trial[lower], levels[lower]
             for values, each in zip(equations, new, strict=False):
                 values[rows] = each[lower]
-            damping[rows] = np.maximum(damping[rows] * LOWERED / RAISED, LEAST_DAMPING)
+            damping[rows] = np.maximum(damping[rows] * c.LOWERED / c.RAISED, c.LEAST_DAMPING)
             taken[rows] += 1
     fits.parameters[chosen, :n], fits.constants[chosen], fits.converged[chosen] = tones, constants, done
 
@@ -109,7 +93,7 @@ def covariances_of(gram: Array, used: IndexArray) -> Array:
     """Return the blocks of the inverse normal matrices that belong to one tone each, shape (R, n, 5, 5)."""
     n = gram.shape[1] // PARAMETERS
     free = np.arange(gram.shape[1]) <= PARAMETERS * used[:, None]
-    matrix, scales = _scaled(gram, free, np.full(used.size, RIDGE))
+    matrix, scales = _scaled(gram, free, np.full(used.size, c.RIDGE))
     inverse = np.linalg.inv(matrix) / (scales[:, :, None] * scales[:, None, :])
     # Tones that depend on each other to rounding have no certain errors.
     inverse[(np.einsum("rii->ri", inverse) <= 0.0).any(axis=1)] = np.nan
