@@ -96,6 +96,6 @@ def covariances_of(gram: Array, used: IndexArray) -> Array:
     matrix, scales = _scaled(gram, free, np.full(used.size, c.RIDGE))
     inverse = np.linalg.inv(matrix) / (scales[:, :, None] * scales[:, None, :])
     # Tones that depend on each other to rounding have no certain errors.
-    inverse[(np.einsum("rii->ri", inverse) <= 0.0).any(axis=1)] = np.nan
+    inverse[~(np.einsum("rii->ri", inverse) > 0.0).all(axis=1)] = np.nan
     blocks = inverse[:, 1:, 1:].reshape(used.size, n, PARAMETERS, n, PARAMETERS)
     return np.asarray(np.einsum("rkakb->rkab", blocks))
