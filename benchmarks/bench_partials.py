@@ -1,12 +1,15 @@
 """Partials of recorded notes: those of an independent fit, and the number of them in a track.
 
-    python benchmarks/bench_partials.py guitar_E2.csv [more.csv] [--windows 4]
+    python benchmarks/bench_partials.py guitar_E2.csv [more.csv] [--windows 4] [--again] [--made]
 
 In windows of one second, exponentially growing chirps are fitted by Gauss-Newton steps with dense linear algebra.
 Peaks of the residual are added if they are 10 dB above the noise floor, a running median. A partial that is 10 dB above
 it in the end is kept if a tone of the track has a row within .3 Hz, and valid if that row is: at the middle of the
 window, or anywhere in it. No two valid readings of one row should be within one bin of their windows. A window takes up
 to two minutes.
+
+The fit itself is uncertain: ``--again`` counts the partials that it finds again in a window that begins 2 ms later, and
+``--made`` those that it finds in white noise, and in twelve harmonics that decay in two stages, each of one frequency.
 """
 
 import argparse
@@ -23,6 +26,9 @@ ROUNDS, STEPS = 25, 10
 MOST_GROWTH, MOST_BEND, LONGEST_STEP = 4.0, 8.0, 2.0
 KEPT_HZ, CLOSE_HZ, STRONG_DB = 0.3, 2.0, 20.0
 EVERY = 0.005
+#: Shift of the windows of ``--again`` [s], and number, fundamental [Hz] and rate of the harmonics of ``--made``.
+SHIFT = 0.002
+HARMONICS, FUNDAMENTAL, RATE = 12, 147.0, 8000
 
 
 def model(u, parameters):
@@ -110,7 +116,29 @@ def readings_twice(hertz, valid, window):
     return count
 
 
-def compare(file, windows):
+def found_again(record, begin, size, bins):
+    """Return which partials the fit finds again within .3 Hz in a window that is shifted by 2 ms."""
+    shift = round(SHIFT / record.interval)
+    shifted = begin - shift if begin else shift
+    again, _ = partials(record.samples[shifted : shifted + size])
+    return (np.abs(bins[:, None] - again) < KEPT_HZ).any(axis=1)
+
+
+def made_records(records):
+    """Print the numbers of partials of white noise, and of harmonics that decay in two stages."""
+    rng, t = np.random.default_rng(20261128), np.arange(RATE) / RATE
+    envelope = 0.7 * np.exp(-t / 0.1) + 0.3 * np.exp(-t / 0.8)
+    for name, amplitude, noise in (("white noise", 0.0, 1.0), (f"{HARMONICS} harmonics", 1.0, 1e-3)):
+        for _ in range(records):
+            phases = rng.uniform(0.0, 6.0, HARMONICS)
+            orders = np.arange(1, HARMONICS + 1)
+            tones = np.cos(2.0 * np.pi * FUNDAMENTAL * np.outer(t, orders) + phases) / orders
+            _, decibels = partials(amplitude * envelope * tones.sum(axis=1) + noise * rng.standard_normal(t.size))
+            strong = int((decibels >= STRONG_DB).sum())
+            print(f"{name}: {strong} partials of 20 dB, {decibels.size - strong} of 10 to 20 dB", flush=True)
+
+
+def compare(file, windows, again):
     """Print, for each window of a record, the partials of the fit and those kept by the track."""
     record = read_sampled_signal(file).in_seconds()
     found = track(record, every=EVERY)
@@ -120,6 +148,7 @@ def compare(file, windows):
     size = round(1.0 / record.interval)
     for begin in np.linspace(0, record.samples.size - size, windows).astype(int):
         bins, decibels = partials(record.samples[begin : begin + size])
+        repeated = found_again(record, begin, size, bins) if again else None
         apart = np.abs(bins[:, None] - bins) + np.where(np.eye(bins.size), np.inf, 0.0)
         instants = found.t - begin * record.interval
         inside, middle = (instants >= 0.0) & (instants <= 1.0), int(np.abs(instants - 0.5).argmin())
@@ -132,17 +161,22 @@ def compare(file, windows):
             kept = f"kept {(which & kept_in).sum():3} ({(which & kept_at).sum():3} at the middle)"
             valid = f"valid {(which & valid_in).sum():3} ({(which & valid_at).sum():3})"
             lost = f"lost within {CLOSE_HZ:g} Hz of another {close.sum():3}"
+            lost += "" if repeated is None else f"; found again {(which & repeated).sum():3}"
             start = f"from {begin * record.interval:.2f} s"
             print(f"  {start}, {name:11}: {which.sum():3} partials, {kept}, {valid}; {lost}", flush=True)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", nargs="+")
+    parser.add_argument("files", nargs="*")
     parser.add_argument("--windows", type=int, default=4)
+    parser.add_argument("--again", action="store_true", help="count the partials that a shifted window has too")
+    parser.add_argument("--made", action="store_true", help="count the partials of made records")
     given = parser.parse_args()
+    if given.made:
+        made_records(2)
     for file in given.files:
-        compare(file, given.windows)
+        compare(file, given.windows, given.again)
 
 
 if __name__ == "__main__":

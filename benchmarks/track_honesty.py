@@ -134,7 +134,7 @@ def could_be_right(signal: Signal, places: np.ndarray) -> np.ndarray:
     return possible
 
 
-def judged(signal: Signal, found: Track) -> tuple[int, int, int, int]:
+def count_rows(signal: Signal, found: Track) -> tuple[int, int, int, int]:
     """Return the numbers of valid rows and of wrong ones, of rows that could be right, and of those valid and right."""
     places = np.minimum(np.round(found.t).astype(int), signal.samples.size - 1)
     possible = could_be_right(signal, places)
@@ -153,7 +153,7 @@ def judged(signal: Signal, found: Track) -> tuple[int, int, int, int]:
 
 def honesty(signals: int, seed: int, show: bool) -> None:
     """Print the table of random signals."""
-    print(f"{'asked for':12} {'valid rows':>10} {'wrong':>7} {'':8} {'could be right':>14} {'valid of them':>13}")
+    print(f"{'requested':12} {'valid rows':>10} {'wrong':>7} {'':8} {'could be right':>14} {'valid of them':>13}")
     for name, more in (("one fewer", -1), ("as many", 0), ("two more", 2), ("auto", None)):
         total = np.zeros(4, int)
         for k in range(signals):
@@ -166,7 +166,7 @@ def honesty(signals: int, seed: int, show: bool) -> None:
                 places = np.arange(0.0, signal.samples.size - 0.5, every).astype(int)
                 total[2] += int(could_be_right(signal, places).sum())
                 continue
-            one = judged(signal, found)
+            one = count_rows(signal, found)
             total += one
             if show and one[1]:
                 print(f"   signal {k}: {one[1]} of {one[0]} valid rows are wrong")

@@ -58,11 +58,11 @@ class ToneOptions:
 
     def follow(self, record: SampledSignal) -> Track:
         """Return the track of a record."""
-        from ctid_cli.tones.constants import MOST_ASKED
+        from ctid_cli.tones.constants import MOST_TONES
         from ctid_cli.tones.track import track as follow
 
-        if self.tones != "auto" and not (self.tones.isdecimal() and int(self.tones) <= MOST_ASKED):
-            raise UsageError(f"--tones must be a number from 0 to {MOST_ASKED}, or auto, not {self.tones!r}")
+        if self.tones != "auto" and not (self.tones.isdecimal() and int(self.tones) <= MOST_TONES):
+            raise UsageError(f"--tones must be a number from 0 to {MOST_TONES}, or auto, not {self.tones!r}")
         tones = None if self.tones == "auto" else int(self.tones)
         try:
             with RecordProgress(Path(record.file).name) as tell:

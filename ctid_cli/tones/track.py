@@ -231,7 +231,7 @@ def track(
         if value is not None:
             require_positive(name, value, unit)
     if tones is not None:
-        require_integer("tones", tones, 0, c.MOST_ASKED)
+        require_integer("tones", tones, 0, c.MOST_TONES)
     ready = condition(samples, interval)
     thin = ready.interval
     longest = _longest(window, thin, ready.samples.size)
@@ -244,7 +244,7 @@ def track(
             f"no tone stands out of {samples.size * interval:.4g} s, in which a tone must turn eight times; use a "
             "longer record, or one with less noise"
         )
-    wanted = sorted(paths[: c.MOST_ASKED if tones is None else tones], key=lambda path: _middle(found, path))
+    wanted = sorted(paths[: c.MOST_TONES if tones is None else tones], key=lambda path: _middle(found, path))
     columns = _columns(found, wanted, len(wanted) if tones is None else tones, places, ready)
     lost = paths[len(wanted) :][: c.MOST_MISSING]
     highest = max((_middle(found, path) for path in wanted), default=0.0) / (2.0 * np.pi * thin)
@@ -322,8 +322,8 @@ def _counted(found: int, count: int, tones: int | None) -> Iterator[str]:
     """Yield a sentence on the number of tones and how it was determined."""
     if tones is None:
         more = f" The strongest {count} of {found} are followed." if found > count else ""
-        how = "lines join until the whitened residual shows none, and stay if they are worth their numbers"
-        yield f"Tones: {count}, from the record ({how}: minimum description length).{more}"
+        how = "lines are added until the whitened residual contains none"
+        yield f"Tones: {count}, from the record ({how}).{more}"
 
 
 def _windows_used(found: Readings, paths: list[IndexArray], thin: float) -> Iterator[str]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ctid_cli.frequency.flags import MEANINGS, Flag
 from ctid_cli.text import count, listed
-from ctid_cli.tones.constants import MOST_ASKED
+from ctid_cli.tones.constants import MOST_TONES
 from ctid_cli.tones.track import MissingLine, Track
 
 #: A smaller share of valid rows gives a warning.
@@ -34,7 +34,7 @@ def _missing_lines(track: Track) -> Iterator[str]:
     if lines:
         named = listed([_line_words(line) for line in lines[:MOST_LINES]])
         more = f", and {count(len(lines) - MOST_LINES, 'more line')}" if len(lines) > MOST_LINES else ""
-        wanted = min(track.omega.shape[1] + len(lines), MOST_ASKED)
+        wanted = min(track.omega.shape[1] + len(lines), MOST_TONES)
         what, it = ("a line", "it") if len(lines) == 1 else ("lines", "them")
         yield f"The tones leave {what} at {named}{more}; ask for {wanted} tones to follow {it} too: --tones {wanted}"
 
@@ -50,9 +50,9 @@ def _invalid_rows(track: Track) -> list[str]:
     for k, (flags, there) in enumerate(zip(track.flags.T, track.there.T, strict=True)):
         if reasons := _reasons(flags[there]):
             found.setdefault(reasons, []).append(f"tone {k + 1}")
-    said = [f"{listed(tones).capitalize()}: {reasons}" for reasons, tones in found.items()]
-    more = [f"{count(len(said) - MOST_WARNINGS, 'more tone')} with rows that are not valid."]
-    return said if len(said) <= MOST_WARNINGS else said[:MOST_WARNINGS] + more
+    messages = [f"{listed(tones).capitalize()}: {reasons}" for reasons, tones in found.items()]
+    more = [f"{count(len(messages) - MOST_WARNINGS, 'more tone')} with rows that are not valid."]
+    return messages if len(messages) <= MOST_WARNINGS else messages[:MOST_WARNINGS] + more
 
 
 def _reasons(flags: NDArray[np.uint16]) -> str:

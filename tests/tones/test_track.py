@@ -130,6 +130,14 @@ def test_a_decaying_tone_is_valid_as_long_as_it_is_heard():
     assert np.nanmedian(track.growth) == pytest.approx(-2.0, rel=0.05)
 
 
+def test_a_decay_in_two_stages_is_one_tone_for_each_harmonic():
+    """A least-squares fit that adds every line of the residual divides each into several."""
+    envelope = 0.7 * np.exp(-T / 0.2) + 0.3 * np.exp(-T / 1.6)
+    track = follow(10.0 * envelope * (tone(60.0) + tone(120.0, 0.5, 1.0) + tone(180.0, 0.3, 2.0)))
+    assert [wrong(track, k, 60.0 * (k + 1)) for k in range(track.omega.shape[1])] == [0, 0, 0]
+    assert track.valid.mean() > 0.9
+
+
 def test_a_spike_spoils_no_valid_row():
     y = tone(60.0)
     y[2000] += 1e6
