@@ -8,7 +8,9 @@ import numpy as np
 from ctid_cli.arrays import BoolArray
 from ctid_cli.estimators.delay_profile import MeasuredFit, MultiInputFit
 from ctid_cli.estimators.identification import Identification, delay_names, free_directions, unsafe_intervals
-from ctid_cli.identification.remedies import Kind, Remedy, Trials, tried_remedies
+from ctid_cli.identification.changes import Kind
+from ctid_cli.identification.remedies import Remedy, Trials, tried_remedies
+from ctid_cli.identification.sentences import spelled
 from ctid_cli.inference.covariance import condition_number, describe_conditioning
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, input_dependence
@@ -74,10 +76,7 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
         or len(found.tests) < len(records) * len(delays_of(fit.model))
     )
     suspicious |= not all(test.white and test.uncorrelated for test in found.tests)
-    # Remedies compare output-error fits only.
-    tried = Trials([], [])
-    if fit.noise is None and not isinstance(fit, MultiInputFit):
-        tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=seen)
+    tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=seen)
     named = [FitWarning(_observed(remedy, found, time_unit), remedy) for remedy in tried.remedies]
     mended = {remedy.kind for remedy in tried.remedies}
     if not seen:
@@ -112,14 +111,14 @@ def _observed(remedy: Remedy, found: Identification, time_unit: str) -> str:
         return f"The input is taken with --hold {' --hold '.join(found.records[0].hold_options)}"
     if remedy.kind == "treatment":
         return f"The fit is made with --initial-state {options.initial_state} --offset {options.offset}"
+    if remedy.kind == "delay" and (ends := [each for each in _delays_at_ends(fit, time_unit) if "end of" in each]):
+        return ends[0]
     low, high = options.delay_bounds
-    if remedy.kind == "delay" and fit.status is Status.DELAY_AT_BOUND:
-        return f"The delay lies at the end of its range, {fit.model.delay:.4g} {time_unit}"
     if remedy.kind == "delay" and low == high:
         return f"The delay is taken as {low:g} {time_unit}"
-    if getattr(remedy.options, "integrators", 0) and (slow := _slow_pole(found, time_unit)):
+    if "--integrators" in remedy.option and (slow := _slow_pole(found, time_unit)):
         return slow
-    return _dependence(found) or f"The model has {count(options.poles, 'pole')} and {count(options.zeros, 'zero')}"
+    return _dependence(found) or f"The model has {spelled(options)}"
 
 
 def _dependence(found: Identification, least: float = 0.05) -> str:
@@ -246,13 +245,17 @@ def of_search(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
         met = () if fit.box is None else fit.box.limits_met(fit.held_poles)
         why = "".join(f"; the {limit.what} is {value:.4g}: {limit.meaning}" for _, limit, value in met)
         yield f"Held at the border of the admissible models: {held} (poles, rad/{time_unit}){why}"
-    if fit.status is Status.DELAY_AT_BOUND:
-        names, delays = delay_names(fit), delays_of(fit.model)
-        for name, delay in zip(names, delays, strict=True):
-            if name in fit.parameter_names and not fit.tangent[fit.parameter_names.index(name)].any():
-                where = f"end of its range, {delay:.4g} {time_unit}" if delay else "least possible, 0"
-                of = f" of {name.removesuffix('_delay')}" * (len(names) > 1)
-                yield f"The delay{of} is at the {where}, and has no standard error"
+    yield from (f"{where}, and has no standard error" for where in _delays_at_ends(fit, time_unit))
+
+
+def _delays_at_ends(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
+    """Yield which delays are at the end of their range."""
+    names = delay_names(fit)
+    for name, delay in zip(names, delays_of(fit.model), strict=True) if fit.status is Status.DELAY_AT_BOUND else ():
+        if name in fit.parameter_names and not fit.tangent[fit.parameter_names.index(name)].any():
+            where = f"end of its range, {delay:.4g} {time_unit}" if delay else "least possible, 0"
+            of = f" of {name.removesuffix('_delay')}" * (len(names) > 1)
+            yield f"The delay{of} is at the {where}"
 
 
 def of_lost_poles(fit: MeasuredFit) -> Iterator[str]:

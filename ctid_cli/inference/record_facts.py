@@ -196,6 +196,14 @@ def _response_p_value(record: Record) -> float:
     return test.p_value
 
 
+def output_outliers(record: Record) -> tuple[float, ...]:
+    """Return the instants of the outliers of an output; none where the response cannot be modelled."""
+    present = record.y[record.valid]
+    if record.several or present.size < FEWEST_SAMPLES or np.ptp(present) == 0.0:
+        return ()
+    return () if input_moves(record).kind == "constant" else decompose(record).outliers
+
+
 def decompose(record: Record) -> Decomposition:
     """Fit the response of a record with a varying input, without outliers, and test the other parts of the output."""
     every = -(-int(np.count_nonzero(record.valid)) // MOST_SAMPLES)

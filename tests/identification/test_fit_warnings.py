@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.identification.fit_warnings import MOST, fit_warnings
@@ -50,6 +50,15 @@ def step_of(lead, model=SYSTEM):
     return Record(t, simulate(model, signal, t) + NOISE * rng.standard_normal(t.size), signal)
 
 
+def two_inputs(delay=0.0, seed=0, n=600):
+    """Return the sum of the responses of two systems of second order to two inputs."""
+    rng, t = np.random.default_rng(seed), 0.2 * np.arange(n)
+    u1, u2 = (np.repeat(rng.choice([-1.0, 1.0], n), rng.integers(3, 12, n))[:n] for _ in range(2))
+    pairs = zip((SYSTEM, replace(SYSTEM, delay=delay)), (u1, u2), strict=True)
+    x = sum(simulate(model, HeldSignal(t, u), t) for model, u in pairs)
+    return Record(t, x + NOISE * rng.standard_normal(n), {"u1": u1, "u2": u2})
+
+
 def looped(gain=0.8, n=1000):
     """Return a record in the loop of a proportional controller."""
     rng = np.random.default_rng(5)
@@ -79,13 +88,20 @@ MENDED = {
     "a delay outside the range": (
         record_of(LATE),
         SEARCHED,
-        "The delay lies at the end of its range, 1 s: with --delay ",
+        "The delay is at the end of its range, 1 s: with --delay ",
     ),
     "the wrong hold": (record_of(hold="foh", read_as="zoh", interval=0.8), KNOWN, "with --hold foh the held-back"),
     "outliers": (spoilt(CLEAN, FEW, 50 * NOISE), KNOWN, "15 output samples are outliers (t = 8, 20.2, 32.4 s, ...)"),
     "an offset": (changed(CLEAN, CLEAN.y + 0.3), KNOWN, "with --offset estimate the held-back fit is"),
     "a drift": (DRIFTING, KNOWN, "with --offset drift the held-back fit is"),
     "a step of one pole too few": (step_of(20.0), FIRST_ORDER, "with --poles 2 --zeros 0 BIC of the innovations is"),
+    "one pole too few, two inputs": (two_inputs(), FIRST_ORDER, "with --poles 2 --zeros 0 the held-back fit is"),
+    "a delay of the second input": (two_inputs(2.5), SEARCHED, "with --delay u2=0:12 the held-back fit is"),
+    "one pole too few for the first input": (
+        two_inputs(),
+        replace(FIRST_ORDER, inputs=(InputModel("u1", poles=1), InputModel("u2", poles=2))),
+        "with --poles u1=2 --zeros u1=0 the held-back fit is",
+    ),
     "a submodel too few": (CLEAN, MeasuredSubmodels((Term(1, 0),)), "with --terms 2/0 BIC of the innovations is"),
 }
 SEEN = {
