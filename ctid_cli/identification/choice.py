@@ -108,7 +108,7 @@ class Given:
     def check(self) -> None:
         """Raise an OptionError if given options contradict each other."""
         if self.modes is not None and (self.fixed or self.poles is not None or self.zeros is not None):
-            raise OptionError("modes", "modes choose the submodels: give no poles, zeros or known coefficients besides")
+            raise OptionError("modes", "modes choose the submodels: give no poles, zeros or known coefficients")
         delays = self.delay_bounds or (0.0, 1.0)
         (least, most), (fewest_zeros, _) = self.span.poles, self.span.zeros
         integrators = max(self.span.integrators)
@@ -158,16 +158,16 @@ class Choice:
     sentences: tuple[str, ...]
 
     @property
-    def seen(self) -> bool:
-        """Whether there is a model, that is, whether a response is detected."""
+    def has_model(self) -> bool:
+        """Whether a response is detected."""
         return self.answer.seen
 
     @property
-    def why_none(self) -> str:
+    def why_no_model(self) -> str:
         """Reason why there is no model."""
         evidence = f" {self.answer.evidence}" if self.answer.explained == self.answer.explained else ""
         return (
-            "There is no model here: the output is not seen to answer to the input "
+            "No model: no response of the output to the input is detected "
             f"({probability(self.answer.p_value)}).{evidence}"
         )
 

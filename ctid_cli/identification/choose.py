@@ -89,7 +89,7 @@ class _Choosing:
         self.records, self.given, self.time_unit = records, given, time_unit
         drifts = len(given.span.integrators) > 1 and given.offset != "none" and changes_at_the_beginning_only(records)
         self.span = given.span._replace(integrators=(0,)) if drifts else given.span
-        self.about_record = [sentences.NO_INTEGRATOR] if drifts else []
+        self.first_reasons = [sentences.NO_INTEGRATOR] if drifts else []
         # A periodic state is that of the whole record.
         self.part, self.from_start = (records, True) if given.initial_state == "periodic" else parts_of(records)
         self.loss: LossKind = given.loss or "squares"
@@ -97,14 +97,14 @@ class _Choosing:
             instants = [output_outliers(record) for record in self.part]
             if any(instants):
                 self.loss = "tukey"
-                self.about_record.insert(0, sentences.of_outliers(sum(map(len, instants))))
+                self.first_reasons.insert(0, sentences.of_outliers(sum(map(len, instants))))
                 self.part = [
                     replace(record, y=np.where(np.isin(record.t, at), np.nan, record.y))
                     for record, at in zip(self.part, instants, strict=True)
                 ]
         self.several = Several(given.delays_of_inputs, not isinstance(given.zeros, int))
         self.first_hold: Holds = "zoh" if given.hold == "auto" else given.hold
-        self.said: list[str] = []
+        self.reasons: list[str] = []
 
     def choice(self) -> Choice:
         """Return the choice."""
@@ -124,8 +124,8 @@ class _Choosing:
         while self.given.delays_given is None and _at_end(ranking, delays) and delays[1] < latest:
             delays = 0.0, _rounded(min(2.0 * delays[1], latest))
             ranking = standing(self._grid(setting, delays), self._held(setting))
-        said = sentences.of_grid(ranking, delays, self.given, self.time_unit)
-        return self._chosen(ranking.best.options, setting, ranking, said)
+        about = sentences.of_grid(ranking, delays, self.given, self.time_unit)
+        return self._chosen(ranking.best.options, setting, ranking, about)
 
     def _typed(self, setting: Setting, delays: tuple[float, float]) -> Choice:
         """Return the choice if degrees of single inputs are given."""
@@ -135,8 +135,8 @@ class _Choosing:
         degrees = {"poles": given.poles, "zeros": given.zeros or 0, "integrators": given.integrators or 0}
         own: Any = {**degrees, "delay_bounds": delays, "inputs": given.inputs}
         options = replace(treated, **own)
-        said = sentences.of_range(delays, given, self.time_unit)
-        return self._chosen(options, setting, ranking, said)
+        about = sentences.of_range(delays, given, self.time_unit)
+        return self._chosen(options, setting, ranking, about)
 
     def _chosen(self, options: Searched, setting: Setting, ranking: Ranking, about: Sequence[str]) -> Choice:
         """Return a choice with its sentences."""
@@ -149,10 +149,10 @@ class _Choosing:
         fitted = tuple(self._held(setting))
         measured = best.options.prepare(fitted).laid_out
         answer = answer_of(best.options, measured.records, measured.used())
-        said = [*self.about_record, *self.said, *about]
-        said += [sentences.of_criterion(ranking)] * bool(said)
+        reasons = [*self.first_reasons, *self.reasons, *about]
+        reasons += [sentences.of_criterion(ranking)] * bool(reasons)
         held = tuple(with_hold(record, setting.hold) for record in self.records)
-        return Choice(options, held, fitted, ranking, answer, tuple(said))
+        return Choice(options, held, fitted, ranking, answer, tuple(reasons))
 
     def _grid(self, setting: Setting, delays: tuple[float, float]) -> Ranking:
         if not self.from_start:
@@ -181,8 +181,8 @@ class _Choosing:
             return given, given[1]
         length = min(record.duration for record in self.part)
         hints = [analyse_response(each).delay for record in self.part for each in record.each_input]
-        seen = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
-        latest = _rounded(min(max(LATEST * length, seen), LATER * length))
+        later = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
+        latest = _rounded(min(max(LATEST * length, later), LATER * length))
         # Assuming rest may bias the delay; an estimated state does not.
         settings = self._settings(latest)[-1:]
         models = self._small(self._common(settings, latest), self.span, (0.0, latest), most=2).compared(settings)
@@ -206,7 +206,7 @@ class _Choosing:
 
     def _setting(self, span: Span, delays: tuple[float, float], near: AnyModel | None = None) -> Setting:
         """Return the best state, offset and hold with structures of a span; searches may start at a known model."""
-        self.said = []
+        self.reasons = []
         settings = self._settings(delays[1])
         rests = [each for each in settings if each.initial_state == "rest"]
         if len(rests) > 1:
@@ -223,7 +223,7 @@ class _Choosing:
         holds = self._holds()
         if len(holds) > 1:
             compared = models.compared([setting._replace(hold=hold) for hold in holds])
-            self.said.append(sentences.of_hold(compared))
+            self.reasons.append(sentences.of_hold(compared))
             setting = setting._replace(hold=compared.best.hold)
         return setting
 
@@ -235,12 +235,12 @@ class _Choosing:
             at_rest = rest.best.criterion <= estimated.best.criterion + TIE
             likely = not at_rest or beginning_is_likely(rest.best, models.noise, self.part, length)
             chosen = rest if at_rest and likely else estimated
-            self.said.append(sentences.of_state(rest.best, estimated.best, likely))
+            self.reasons.append(sentences.of_state(rest.best, estimated.best, likely))
         elif self.given.initial_state is None:
             options = models.best.options
-            self.said.append(sentences.rest_assumed(options) if self.from_start else sentences.STATE_OF_PART)
+            self.reasons.append(sentences.rest_assumed(options) if self.from_start else sentences.STATE_OF_PART)
         if self.given.offset is None:
-            self.said.append(sentences.of_offset(chosen))
+            self.reasons.append(sentences.of_offset(chosen))
         return chosen.best.options
 
     # --- settings to compare ---------------------------------------------------------------------------

@@ -127,12 +127,12 @@ def ranked(candidates: Sequence[Candidate]) -> Ranking:
     """Rank candidates by their criterion; all must have been fitted to the same samples."""
     closest = min(candidates, key=lambda each: (not each.is_admissible, each.fit.cost))
     noise = noise_of(closest.fit.residuals)
-    return Ranking(in_order([_judged(each, noise) for each in candidates]), noise)
+    return Ranking(in_order([_with_criterion(each, noise) for each in candidates]), noise)
 
 
-def in_order(judged: Sequence[Candidate]) -> tuple[Candidate, ...]:
+def in_order(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
     """Return candidates by increasing criterion, inadmissible ones last."""
-    return tuple(sorted(judged, key=lambda each: (not each.is_admissible, each.criterion)))
+    return tuple(sorted(candidates, key=lambda each: (not each.is_admissible, each.criterion)))
 
 
 def criteria_of(models: Sequence[Errors], parameters: Sequence[int]) -> list[float]:
@@ -150,7 +150,7 @@ def noise_of(residuals: Sequence[Array]) -> NoiseModel:
     return fit_noise_model(residuals, penalty=float(np.log(sum(block.size for block in residuals))))
 
 
-def _judged(candidate: Candidate, noise: NoiseModel) -> Candidate:
+def _with_criterion(candidate: Candidate, noise: NoiseModel) -> Candidate:
     fit, size = candidate.fit, candidate.size
     count = innovations_count(fit.residuals, noise)
     squared = squared_innovations(fit.residuals, [psi @ fit.tangent for psi in fit.sensitivities], noise)

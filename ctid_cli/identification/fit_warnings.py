@@ -69,20 +69,20 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
         loop = ". In a loop the plant may be unstable: that needs the controller (--loop FILE)"
         unfinished = fit.status.value.removesuffix(".")
         return [FitWarning(f"{unfinished}{loop * any(record.loop is not None for record in records)}")]
-    seen = found.answer.seen
+    detected = found.answer.seen
     suspicious = (
         fit.fit_percent < LOW_FIT
         or fit.status is not Status.CONVERGED
         or len(found.tests) < len(records) * len(delays_of(fit.model))
     )
     suspicious |= not all(test.white and test.uncorrelated for test in found.tests)
-    tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=seen)
+    tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=detected)
     named = [FitWarning(_observed(remedy, found, time_unit), remedy) for remedy in tried.remedies]
-    mended = {remedy.kind for remedy in tried.remedies}
-    if not seen:
-        no_model = f"No model: the output is not seen to respond to the input ({probability(found.answer.p_value)})"
+    remedied = {remedy.kind for remedy in tried.remedies}
+    if not detected:
+        no_model = f"No model: no response of the output to the input is detected ({probability(found.answer.p_value)})"
         return [FitWarning(f"{no_model}. {found.answer.evidence[:-1]}"), *named]
-    others = [*of_lost_poles(fit), *_of_residuals(found, mended, time_unit)]
+    others = [*of_lost_poles(fit), *_of_residuals(found, remedied, time_unit)]
     if not named:
         # The search and the errors of an estimate that will change are not reported.
         others += [
@@ -173,22 +173,24 @@ def _slow_pole(found: Identification, time_unit: str) -> str:
 
 def _of_validation(found: Identification) -> Iterator[FitWarning]:
     fitted, other = found.fit.r2, found.validation
-    if other is not None and (seen := found.seen_in_validation):
-        what = f"{seen} of the {count(other.record.n_samples, 'sample')} of the validation record are those that"
+    if other is not None and (shared := found.seen_in_validation):
+        what = f"{shared} of the {count(other.record.n_samples, 'sample')} of the validation record are those that"
         yield FitWarning(
             f"{what} the model was estimated from, so its fit there is no test; give a record without them"
         )
     if other is not None and other.r2 < 0.5 < fitted:
         what = f"The model explains {100 * fitted:.0f} % of the variance of the record it was estimated from, but only"
-        yield FitWarning(f"{what} {100 * max(other.r2, 0.0):.0f} % of the validation record's: it does not carry over")
+        yield FitWarning(
+            f"{what} {100 * max(other.r2, 0.0):.0f} % of the validation record's: the model does not generalise"
+        )
 
 
-def _of_residuals(found: Identification, mended: set[Kind], time_unit: str) -> Iterator[str]:
+def _of_residuals(found: Identification, remedied: set[Kind], time_unit: str) -> Iterator[str]:
     """Yield warnings about residuals and outputs."""
-    if not mended & {"structure", "delay", "hold"} and (what := _dependence(found, DEPENDENT)):
+    if not remedied & {"structure", "delay", "hold"} and (what := _dependence(found, DEPENDENT)):
         yield f"{what}: {AHEAD if 'later values' in what else 'the model misses a part of the response'}"
     outliers = _outliers(found, time_unit)
-    if outliers and "loss" not in mended:
+    if outliers and "loss" not in remedied:
         yield outliers
     share = max(saturated(record.y[record.valid]) for record in found.records)
     if share:
@@ -206,13 +208,13 @@ def _of_residuals(found: Identification, mended: set[Kind], time_unit: str) -> I
             input_dependence(e, x, psi, t, one, delay)
             for one, delay in zip(acting.each_input, delays_of(fit.model), strict=True)
         ]
-        seen = min(filter(None, dependences), key=lambda each: each.feedback_p_value, default=None)
-        if seen is None or seen.feedback_share < FEEDBACK_SHARE:
+        clearest = min(filter(None, dependences), key=lambda each: each.feedback_p_value, default=None)
+        if clearest is None or clearest.feedback_share < FEEDBACK_SHARE:
             continue
         # Missed dynamics may correlate residuals with later inputs too.
-        if seen.feedback_p_value < min(FED_BACK, seen.pole_p_value):
+        if clearest.feedback_p_value < min(FED_BACK, clearest.pole_p_value):
             what = "The input follows earlier residuals" if acting is record else "The reference follows the output"
-            where = f"{what} ({probability(seen.feedback_p_value)})"
+            where = f"{what} ({probability(clearest.feedback_p_value)})"
             yield f"{where}, as in a loop, where noise biases the estimate, or as if the output is ahead of the input"
 
 
@@ -262,7 +264,7 @@ def of_lost_poles(fit: MeasuredFit) -> Iterator[str]:
     """Yield that the model has fewer poles than specified."""
     if lost := fit.poles_at_infinity:
         gone = f"{'it has' if lost == 1 else 'they have'} run to infinity, where the cost is least"
-        yield f"The model has {count(lost, 'pole')} fewer than asked for: {gone}"
+        yield f"The model has {count(lost, 'pole')} fewer than specified: {gone}"
 
 
 def of_conditioning(fit: MeasuredFit, known: Uncertainty) -> Iterator[str]:
@@ -276,8 +278,8 @@ def of_conditioning(fit: MeasuredFit, known: Uncertainty) -> Iterator[str]:
         names.append(fit.parameter_names[place] if own else f"pole {len(names) + 1}")
         any_value = names[-1].startswith("a") and not fit.signs_known
         values.append(np.inf if any_value else fit.theta[place])
-    told = describe_conditioning(known.free_covariance, np.array(values), names, condition_number(hessian), hessian)
-    yield from (each.removesuffix(".") for each in told)
+    found = describe_conditioning(known.free_covariance, np.array(values), names, condition_number(hessian), hessian)
+    yield from (each.removesuffix(".") for each in found)
 
 
 def _of_uncertainty(found: Identification, time_unit: str) -> Iterator[str]:

@@ -118,14 +118,14 @@ def standing(ranking: Ranking, records: Sequence[Record]) -> Ranking:
             best_of.setdefault(each.options.order, each)
     if len(best_of) < 2 or not long_enough(records):
         return ranking
-    seen = {order: replace(each, unseen=_unseen(each, records)) for order, each in best_of.items()}
+    checked = {order: replace(each, unseen=_unseen(each, records)) for order, each in best_of.items()}
     most = ranking.best.options.order
-    while smaller := [each for order, each in seen.items() if order < most]:
-        if not seen[most].unseen > OPTIMISTIC * min(each.unseen for each in smaller):
+    while smaller := [each for order, each in checked.items() if order < most]:
+        if not checked[most].unseen > OPTIMISTIC * min(each.unseen for each in smaller):
             break
         most = min(smaller, key=lambda each: each.criterion).options.order
-    looked_at = {id(each): seen[order] for order, each in best_of.items()}
-    found = [looked_at.get(id(each), each) for each in ranking.candidates]
+    replaced = {id(each): checked[order] for order, each in best_of.items()}
+    found = [replaced.get(id(each), each) for each in ranking.candidates]
     return replace(ranking, candidates=in_order([replace(each, stands=each.options.order <= most) for each in found]))
 
 

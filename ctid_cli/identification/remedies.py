@@ -48,10 +48,10 @@ class Remedy:
     #: Fit of all samples without and with the change [%].
     fits: tuple[float, float]
     #: Whether it is combined with the remedies before it.
-    besides: bool = False
+    in_addition: bool = False
 
     def __str__(self) -> str:
-        made = f"with {self.option}{' besides' * self.besides}"
+        made = f"with {self.option}{' in addition' * self.in_addition}"
         if self.held_back:
             return f"{made} the held-back fit is {self.after:.1f} instead of {self.before:.1f} %"
         numbers = f"BIC of the innovations is {self.after:.1f} instead of {self.before:.1f}, the fit"
@@ -157,7 +157,7 @@ def _with_best(base: FittedOptions, kinds: Sequence[Kind], found: Trials) -> tup
     if not helpful:
         return base, ()
     remedy, changed = _simplest(helpful)
-    found.remedies.append(replace(remedy, besides=bool(found.remedies)))
+    found.remedies.append(replace(remedy, in_addition=bool(found.remedies)))
     return changed, tuple(other.remedy.kind for other in helpful if other.remedy is not remedy)
 
 

@@ -49,7 +49,7 @@ def rest_assumed(options: Searched) -> str:
     level = "its first value" if options.input_before == "first" else f"{options.input_before or 0:g}"
     return (
         f"State before the record: at rest with the input at {level}, which is assumed: the input does not change "
-        "enough after the longest delay to estimate a state besides (--initial-state, --input-before)."
+        "enough after the longest delay to estimate a state too (--initial-state, --input-before)."
     )
 
 
@@ -117,7 +117,7 @@ def _too_large(ranking: Ranking) -> list[str]:
     each, best = min(larger, key=lambda each: each.criterion), ranking.best
     named = f"{each.name} (criterion {best.criterion - each.criterion:.3g} lower)"
     return [
-        f"Not larger: in blocks that it did not see the squared error of {named} is {each.unseen:.2g} times that "
+        f"Not larger: in held-back blocks the squared error of {named} is {each.unseen:.2g} times that "
         f"of its fit; that of {best.name} is {best.unseen:.2g} times."
     ]
 

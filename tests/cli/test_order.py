@@ -56,7 +56,7 @@ def test_noise_has_no_order(ctid, tmp_path):
     done = ctid("order", record, "--poles", "1:2", "--zeros", "0", "--delay", "0:1", "--json", "--out", tmp_path)
     content = json.loads(done.stdout)
     assert content["recommended"] is None
-    assert content["reason"].startswith("There is no model here")
+    assert content["reason"].startswith("No model: no response")
 
 
 def test_a_record_too_short_for_some_structures(ctid, tmp_path):

@@ -147,7 +147,7 @@ def test_a_model_that_does_not_carry_over_is_said():
     x = simulate(result.fit.model, other.input, other.t)
     assert result.validation.r2 == pytest.approx(1 - np.mean((other.y - x) ** 2) / np.var(other.y))
     assert result.validation.r2 < 0
-    assert any("does not carry over" in warning for warning in result.warnings)
+    assert any("does not generalise" in warning for warning in result.warnings)
 
 
 def test_validation_estimates_its_own_state_and_offset():
@@ -162,7 +162,7 @@ def test_where_no_answer_is_seen_the_first_warning_says_so():
     noise = Record(record.t, np.random.default_rng(3).standard_normal(300), record.input)
     result = identify([noise], DelayProfile(1, 0, (0, 3), offset="estimate"))
     assert not result.answer.seen
-    assert result.warnings[0].startswith("No model: the output is not seen to respond to the input (p = ")
+    assert result.warnings[0].startswith("No model: no response of the output to the input is detected (p = ")
     for name in ("b0", "a1", "delay"):
         item = by_name(result)[name]
         assert (item.status, np.isnan(item.standard_error)) == ("undetermined", True)

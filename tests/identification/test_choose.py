@@ -194,20 +194,20 @@ def test_a_validation_record_has_a_state_and_an_offset_of_its_own():
     assert found.validation.fit_percent > 85
 
 
-def test_a_validation_record_is_judged_and_enters_nothing_else():
+def test_a_validation_record_does_not_change_the_model():
     other = record_of(TransferFunction([-2.0], [1.0, 1.2, 4.0], 0.23), seed=1)
-    alone, judged = (identify(record_of(SECOND), validation=each) for each in (None, other))
-    first, *others = judged.warnings
-    assert "it does not carry over" in first
-    assert (judged.choices, judged.options, others) == (alone.choices, alone.options, list(alone.warnings))
-    np.testing.assert_array_equal(judged.fit.theta, alone.fit.theta)
+    alone, validated = (identify(record_of(SECOND), validation=each) for each in (None, other))
+    first, *others = validated.warnings
+    assert "does not generalise" in first
+    assert (validated.choices, validated.options, others) == (alone.choices, alone.options, list(alone.warnings))
+    np.testing.assert_array_equal(validated.fit.theta, alone.fit.theta)
 
 
 def test_no_response_is_no_model():
     noise = record_of(SECOND)
     noise = Record(noise.t, np.random.default_rng(5).standard_normal(600), noise.input)
     assert not choose(noise).seen
-    with pytest.raises(DataError, match="no model here"):
+    with pytest.raises(DataError, match="No model"):
         identify(noise)
 
 

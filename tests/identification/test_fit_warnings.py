@@ -76,7 +76,7 @@ CLEAN = record_of()
 FEW = 40 + 61 * np.arange(15)
 FREE = 3.0 * np.exp(-0.4 * CLEAN.t) * np.cos(1.36 * CLEAN.t)
 DRIFTING = changed(CLEAN, CLEAN.y + 5.0 + 10 * NOISE * np.linspace(0, 1, 1000))
-MENDED = {
+REMEDIED = {
     "one pole too few": (CLEAN, FIRST_ORDER, "with --poles 2 --zeros 0 the held-back fit is"),
     "two poles too few": (
         record_of(TransferFunction([8.0, 4.0, 20.0], np.polymul([1.0, 0.4, 2.0], [1.0, 0.8, 12.0]))),
@@ -104,24 +104,24 @@ MENDED = {
     ),
     "a submodel too few": (CLEAN, MeasuredSubmodels((Term(1, 0),)), "with --terms 2/0 BIC of the innovations is"),
 }
-SEEN = {
+OBSERVED = {
     "an unstable plant": (record_of(TransferFunction([1.0], [1.0, -0.04])), FIRST_ORDER, "The output diverges"),
     "feedback": (looped(), FIRST_ORDER, "The input follows earlier residuals"),
     "saturation": (changed(CLEAN, np.clip(CLEAN.y, -0.9, 0.9)), KNOWN, "exactly at the least or greatest value"),
 }
 
 
-@pytest.mark.parametrize("fault", MENDED)
+@pytest.mark.parametrize("fault", REMEDIED)
 def test_a_planted_fault_is_named_first_with_a_remedy_that_was_tried(fault):
-    record, options, words = MENDED[fault]
+    record, options, words = REMEDIED[fault]
     warnings = identify([record], options).warnings
     assert words in warnings[0]
     assert len(warnings) <= MOST
 
 
-@pytest.mark.parametrize("fault", SEEN)
+@pytest.mark.parametrize("fault", OBSERVED)
 def test_what_has_no_remedy_is_said_without_one(fault):
-    record, options, words = SEEN[fault]
+    record, options, words = OBSERVED[fault]
     (found,) = (warning for warning in identify([record], options).warnings if words in warning)
     assert "--" not in found
 
@@ -147,10 +147,10 @@ def test_a_low_fit_says_what_was_tried_without_gain():
     assert "tried without gain: other values of --poles, --zeros, " in low
 
 
-def test_another_remedy_is_named_besides_the_first():
+def test_another_remedy_is_named_in_addition_to_the_first():
     record = changed(CLEAN, CLEAN.y + 0.6)
     found = tried_remedies([record], FIRST_ORDER, FIRST_ORDER.fit([record])).remedies
-    assert [remedy.besides for remedy in found] == [False, True]
+    assert [remedy.in_addition for remedy in found] == [False, True]
     assert [remedy.kind for remedy in found] == ["structure", "treatment"]
     assert found[1].before == pytest.approx(found[0].after, abs=0.01)
     assert found[1].options == replace(found[0].options, offset="estimate")
