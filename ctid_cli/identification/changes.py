@@ -9,12 +9,9 @@ import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.estimation.optimum.best_model import Begin
-from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, InputModel, MeasuredFit
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.identification.held_back import held_back_errors
 from ctid_cli.inference.signal_features import input_moves
-from ctid_cli.models.additive import Term, terms_text
 from ctid_cli.models.several_inputs import delays_of, fractions_of
 from ctid_cli.signals.held import Hold, regular_interval
 from ctid_cli.signals.record import Record
@@ -29,8 +26,6 @@ DAMPING = 0.3
 #: Two poles, a pair, of rate 1 rad/s.
 PAIR = np.roots([1.0, 2.0 * DAMPING, 1.0])
 
-#: Estimators of sums of submodels.
-SUMS = MeasuredSubmodels | AdditiveOutputError
 Kind = Literal["loss", "structure", "delay", "hold", "treatment"]
 
 
@@ -38,7 +33,7 @@ Kind = Literal["loss", "structure", "delay", "hold", "treatment"]
 class FittedOptions:
     """A fit of an estimator to records with a hold of their inputs."""
 
-    options: Any
+    options: DelayProfile
     hold: Holds
     records: tuple[Record, ...]
     fit: MeasuredFit
@@ -47,11 +42,6 @@ class FittedOptions:
     def parameters(self) -> int:
         """Number of free parameters, including those at infinity."""
         return self.fit.theta.size - len(self.fit.known) + self.fit.poles_at_infinity
-
-    @property
-    def is_sum(self) -> bool:
-        """Whether the model is a sum of submodels, which are always searched anew."""
-        return isinstance(self.options, SUMS)
 
     @property
     def denominators(self) -> dict[str, DelayProfile]:
@@ -78,16 +68,10 @@ class FittedOptions:
         """Output errors of held-back blocks."""
         return held_back_errors(self.options, self.records, self.start())
 
-    def each_input(self, options: Any) -> dict[str, Any]:
+    def each_input(self, options: DelayProfile) -> dict[str, DelayProfile]:
         """Return the options of each input by its name, which is empty for a single input."""
         names = tuple(self.records[0].held) if self.records[0].several else ("",)
-        each = options._each(names) if isinstance(options, DelayProfile) else [options]
-        return dict(zip(names, each, strict=True))
-
-    @property
-    def starts(self) -> tuple[Begin, ...]:
-        """Starts of the search for a changed estimate; none for a sum."""
-        return () if self.is_sum else (self.start(),)
+        return dict(zip(names, options._each(names), strict=True))
 
     def start(self, poles: Mapping[str, ComplexArray] | None = None, delays: Sequence[float] | None = None) -> Begin:
         """Return the start of a search at the model, with other poles of some denominators, or other delays [s]."""
@@ -97,15 +81,15 @@ class FittedOptions:
 
 
 class Change(NamedTuple):
-    """Changed options and hold, with starts of the search; none for sums of submodels."""
+    """Changed options and hold, with starts of the search."""
 
-    options: Any
+    options: DelayProfile
     hold: Holds
     starts: Sequence[Begin]
 
 
 def _changed(
-    base: FittedOptions, starts: Sequence[Begin] = (), name: str = "", own: Any = None, **fields: object
+    base: FittedOptions, starts: Sequence[Begin] = (), name: str = "", own: Any = None, **fields: Any
 ) -> Iterator[Change]:
     """Yield a change of options, some of them of a named input, unless the estimator refuses it."""
     options, own = base.options, own or {}
@@ -119,16 +103,13 @@ def _changed(
     except ValueError:
         return
     if options != base.options:
-        yield Change(options, base.hold, starts or base.starts)
+        yield Change(options, base.hold, starts or [base.start()])
 
 
 def _structures(base: FittedOptions) -> Iterator[Change]:
     """Yield one and two more poles of each denominator, more zeros, and an integrator, added or replacing a pole."""
     options = base.options
     if options.fixed or base.fit.poles_at_infinity:
-        return
-    if base.is_sum:
-        yield from _submodels(base)
         return
     offset = "estimate" if options.offset in ("remove", "drift") else options.offset
     for name, own in base.denominators.items():
@@ -143,15 +124,6 @@ def _structures(base: FittedOptions) -> Iterator[Change]:
             yield from _changed(base, fewer, name, {"poles": n - 1, "integrators": 1}, offset=offset)
 
 
-def _submodels(base: FittedOptions) -> Iterator[Change]:
-    """Yield one more pole of the first submodel, and one more submodel."""
-    first, *others = base.options.terms
-    yield from _changed(base, terms=(replace(first, poles=first.poles + 1), *others))
-    if base.options.factored:
-        for poles in (1, 2):
-            yield from _changed(base, terms=(first, *others, Term(poles, 0)))
-
-
 def _with_fewer(poles: ComplexArray) -> Iterator[ComplexArray]:
     """Yield poles without one real pole, or with a real pole of the same size in place of a pair."""
     for pole in poles[poles.imag >= 0.0].tolist():
@@ -161,8 +133,6 @@ def _with_fewer(poles: ComplexArray) -> Iterator[ComplexArray]:
 
 def _delays(base: FittedOptions) -> Iterator[Change]:
     """Yield a range of the delay of each input from zero to a tenth of the record."""
-    if isinstance(base.options, MeasuredSubmodels):
-        return
     shortest = min(record.duration for record in base.records)
     for k, (name, own) in enumerate(base.each_input(base.options).items()):
         reach = float(f"{max(FARTHER * own.delay_bounds[1], LATEST * shortest):.2g}")
@@ -170,7 +140,7 @@ def _delays(base: FittedOptions) -> Iterator[Change]:
             delays = [delays_of(base.fit.model) for _ in range(DELAYS)]
             for each, delay in zip(delays, np.linspace(0.0, reach, DELAYS).tolist(), strict=True):
                 each[k] = delay
-            starts = [] if base.is_sum else [base.start(delays=each) for each in delays]
+            starts = [base.start(delays=each) for each in delays]
             yield from _changed(base, starts, name, {"delay_bounds": (0.0, reach)})
 
 
@@ -188,29 +158,27 @@ def _holds(base: FittedOptions) -> Iterator[Change]:
         for hold in get_args(Hold) if not kinds <= {"constant", "steps"} else ():
             if hold != holds[k] and (hold != "band-limited" or (regular and kinds == {"continuous"})):
                 changed = (*holds[:k], hold, *holds[k + 1 :])
-                yield Change(base.options, changed, base.starts)
+                yield Change(base.options, changed, [base.start()])
 
 
 def _treatments(base: FittedOptions) -> Iterator[Change]:
     """Yield an initial state, an offset, both, and a drift."""
-    options, starts = base.options, []
-    if not base.is_sum:
-        # The missing treatment may have moved the poles far away.
-        alike = [{name: np.full(poles.size, -rate) for name, poles in base.poles.items()} for rate in base.rates]
-        starts = [base.start(), *map(base.start, alike)]
-    offsets = ("remove",) if isinstance(options, MeasuredSubmodels) else ("estimate", "drift")
+    options = base.options
+    # The missing treatment may have moved the poles far away.
+    alike = [{name: np.full(poles.size, -rate) for name, poles in base.poles.items()} for rate in base.rates]
+    starts = [base.start(), *map(base.start, alike)]
     state = "estimate" if options.initial_state == "rest" else options.initial_state
-    for offset in dict.fromkeys((options.offset, *offsets)):
+    for offset in dict.fromkeys((options.offset, "estimate", "drift")):
         for initial_state in dict.fromkeys((options.initial_state, state)):
-            fields = {"initial_state": initial_state, "offset": offset}
-            if getattr(options, "input_before", None) is not None and initial_state != "rest":
+            fields: dict[str, Any] = {"initial_state": initial_state, "offset": offset}
+            if initial_state != "rest":
                 fields["input_before"] = None
             yield from _changed(base, starts, **fields)
 
 
 def _losses(base: FittedOptions) -> Iterator[Change]:
     """Yield a loss that outliers do not affect."""
-    if base.options.loss == "squares" and not isinstance(base.options, MeasuredSubmodels):
+    if base.options.loss == "squares":
         yield from _changed(base, loss="tukey")
 
 
@@ -225,9 +193,7 @@ CHANGES: dict[Kind, Callable[[FittedOptions], Iterator[Change]]] = {
 
 def typed(old: FittedOptions, new: FittedOptions) -> str:
     """Return the options of ``ctid fit`` that turn one fit into another."""
-    before, after = old.options, new.options
-    fractions = not getattr(after, "factored", False)
-    words = [] if fractions or before.terms == after.terms else [f"--terms {terms_text(after.terms)}"]
+    before, after, words = old.options, new.options, list[str]()
     pairs = {name: (own, old.each_input(before)[name]) for name, own in old.each_input(after).items()}
     if len({_degrees(own) + _degrees(was) for own, was in pairs.values()}) == 1:
         pairs = {"": next(iter(pairs.values()))}
@@ -237,9 +203,9 @@ def typed(old: FittedOptions, new: FittedOptions) -> str:
             words.append("--delay {}{:g}:{:g}".format(of, *own.delay_bounds))
         # A number of poles of one input would separate a common denominator.
         of_poles = "" if name and after.common else of
-        if fractions and (own.poles, own.zeros) != (was.poles, was.zeros):
+        if (own.poles, own.zeros) != (was.poles, was.zeros):
             words += [f"--poles {of_poles}{own.poles}", f"--zeros {of}{own.zeros}"]
-        if getattr(own, "integrators", 0) != getattr(was, "integrators", 0):
+        if own.integrators != was.integrators:
             words.append(f"--integrators {of_poles}{own.integrators}")
     for option in ("initial_state", "offset", "loss"):
         if getattr(before, option) != getattr(after, option):
@@ -249,5 +215,5 @@ def typed(old: FittedOptions, new: FittedOptions) -> str:
     return " ".join(dict.fromkeys(words))
 
 
-def _degrees(options: Any) -> tuple[object, ...]:
-    return options.delay_bounds, options.poles, options.zeros, getattr(options, "integrators", 0)
+def _degrees(options: DelayProfile) -> tuple[object, ...]:
+    return options.delay_bounds, options.poles, options.zeros, options.integrators

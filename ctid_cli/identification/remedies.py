@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import is_not
 from typing import NamedTuple, get_args
 
 import numpy as np
@@ -10,7 +11,7 @@ from ctid_cli.errors import CtidError
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.estimators.identification import Options
 from ctid_cli.identification.candidates import with_hold
-from ctid_cli.identification.changes import CHANGES, SUMS, Change, FittedOptions, Kind, typed
+from ctid_cli.identification.changes import CHANGES, Change, FittedOptions, Kind, typed
 from ctid_cli.identification.criterion import criteria_of
 from ctid_cli.identification.held_back import compared, long_enough
 from ctid_cli.inference.signal_features import residual_outliers
@@ -86,7 +87,7 @@ def tried_remedies(
 
     There are at most three, one of each kind: another loss if there are outliers, then the most helpful change.
     Structures, delays and holds are tried if the residuals or the search give a reason, and delays alone if no response
-    to the input is detected. For submodels the criterion decides.
+    to the input is detected. Remedies of transfer functions, of one or several inputs, are tried.
 
     A change helps if three conditions hold. It lowers Schwarz's criterion of the innovations, under one noise model
     (autoregressive, of the residuals of the closer fit) and 1.5 times the usual penalty. It improves the fit of ten
@@ -96,17 +97,14 @@ def tried_remedies(
     them, the criterion decides, and must decrease by ten.
     """
     found = Trials([], [])
-    # In a loop changes are compared by the response to the input, but there the reference drives the loop; and remedies
-    # compare output-error fits only.
-    if not isinstance(options, DelayProfile | SUMS) or fit.noise is not None:
+    # Changes are compared by the output error of the response to the input; in a loop the reference drives that, and
+    # sums of submodels take long to fit.
+    if not isinstance(options, DelayProfile) or fit.noise is not None:
         return found
-    # A record with its loop cannot be cut.
-    most = max(MOST_SAMPLES // len(records), 1)
-    whole = isinstance(options, SUMS) or all(record.n_samples <= most for record in records)
-    part = tuple(records) if whole else tuple(beginning(record, most) for record in records)
+    part = tuple(beginning(record, max(MOST_SAMPLES // len(records), 1)) for record in records)
     base = FittedOptions(options, records[0].hold, part, fit)
     try:
-        if not whole:
+        if any(map(is_not, part, records)):
             base = _refitted(base, part)
         clean = without_outliers(part, base.fit)
         if clean is not None:
@@ -133,14 +131,12 @@ def without_outliers(records: Sequence[Record], fit: MeasuredFit) -> tuple[Recor
 
 def _refitted(base: FittedOptions, records: tuple[Record, ...]) -> FittedOptions:
     """Return the fit to a part of the records, or without outliers."""
-    return _fitted(replace(base, records=records), Change(base.options, base.hold, base.starts))
+    return _fitted(replace(base, records=records), Change(base.options, base.hold, [base.start()]))
 
 
 def _fitted(base: FittedOptions, change: Change) -> FittedOptions:
     """Return the fit with a change."""
     records = tuple(with_hold(record, change.hold) for record in base.records)
-    if base.is_sum:
-        return FittedOptions(change.options, change.hold, records, change.options.fit(records))
     return FittedOptions(change.options, change.hold, records, change.options._refine(records, *change.starts))
 
 
@@ -173,13 +169,13 @@ def _best(base: FittedOptions, kind: Kind, tried: Sequence[FittedOptions]) -> He
     """Return the best of the changes of one kind, if it helps."""
     # The criterion does not apply to another loss.
     falls = [np.inf if kind == "loss" else -float(np.diff(criteria(base, one))[0]) for one in tried]
-    least = 0.0 if _by_blocks(base) else DECISIVE
+    least = 0.0 if long_enough(base.records) else DECISIVE
     better = [k for k in np.argsort(falls)[::-1].tolist() if falls[k] > least]
     helpful = [each for k in better[:MOST_COMPARED] if (each := _helpful(base, kind, tried[k])) is not None]
     if not helpful:
         return None
     best = _simplest(helpful)
-    if kind in ("loss", "hold") or base.is_sum:
+    if kind in ("loss", "hold"):
         return best
     # The search that the estimator makes may find a lower cost, and then must help too.
     searched = replace(best.changed.options, covariance="white").fit(best.changed.records)
@@ -188,29 +184,24 @@ def _best(base: FittedOptions, kind: Kind, tried: Sequence[FittedOptions]) -> He
     return _helpful(base, kind, replace(best.changed, fit=searched))
 
 
-def _by_blocks(base: FittedOptions) -> bool:
-    return not base.is_sum and long_enough(base.records)
-
-
 def _helpful(base: FittedOptions, kind: Kind, changed: FittedOptions) -> Helpful | None:
     """Return a change as a remedy; None if it does not help."""
     fits = base.fit.fit_percent, changed.fit.fit_percent
     made = kind, typed(base, changed), changed.options, changed.hold
-    if not base.is_sum:
-        try:
-            # Another loss must also improve the fit of the other samples.
-            clean = (kind == "loss" and without_outliers(base.records, base.fit)) or base.records
-            errors = [np.where(record.valid, e, np.nan) for record, e in zip(clean, base.errors, strict=True)]
-            gain = compared(errors, changed.errors, base.records)
-        except CtidError:
-            return None
-        if kind == "loss" or _by_blocks(base):
-            # Outliers affect the fit of all blocks; other faults must also show where a fit extrapolates.
-            helps = gain.helps and (kind == "loss" or gain.end <= 1.0)
-            remedy = Remedy(*made, gain.before, gain.after, gain.standard_error, held_back=True, fits=fits)
-            return Helpful(remedy, changed) if helps else None
-        if gain.end >= NO_WORSE:
-            return None
+    try:
+        # Another loss must improve the fit of the samples that are no outliers.
+        clean = (kind == "loss" and without_outliers(base.records, base.fit)) or base.records
+        errors = [np.where(record.valid, e, np.nan) for record, e in zip(clean, base.errors, strict=True)]
+        gain = compared(errors, changed.errors, base.records)
+    except CtidError:
+        return None
+    if kind == "loss" or long_enough(base.records):
+        # Outliers affect the fit of all blocks; other faults must also show where a fit extrapolates.
+        helps = gain.helps and (kind == "loss" or gain.end <= 1.0)
+        remedy = Remedy(*made, gain.before, gain.after, gain.standard_error, held_back=True, fits=fits)
+        return Helpful(remedy, changed) if helps else None
+    if gain.end >= NO_WORSE:
+        return None
     before, after = criteria(base, changed)
     return Helpful(Remedy(*made, before, after, np.nan, held_back=False, fits=fits), changed)
 

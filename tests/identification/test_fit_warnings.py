@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.identification.fit_warnings import MOST, fit_warnings
 from ctid_cli.identification.held_back import block_numbers, compared, held_back_errors
 from ctid_cli.identification.identify import identify
 from ctid_cli.identification.remedies import tried_remedies
 from ctid_cli.inference.fit import Status
-from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
@@ -102,7 +100,6 @@ REMEDIED = {
         replace(FIRST_ORDER, inputs=(InputModel("u1", poles=1), InputModel("u2", poles=2))),
         "with --poles u1=2 --zeros u1=0 the held-back fit is",
     ),
-    "a submodel too few": (CLEAN, MeasuredSubmodels((Term(1, 0),)), "with --terms 2/0 BIC of the innovations is"),
 }
 OBSERVED = {
     "an unstable plant": (record_of(TransferFunction([1.0], [1.0, -0.04])), FIRST_ORDER, "The output diverges"),
