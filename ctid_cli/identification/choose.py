@@ -15,12 +15,11 @@ from ctid_cli.estimation.common import check_greatest_delay
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import answer_of
 from ctid_cli.identification import sentences
-from ctid_cli.identification.candidates import SMALL, Setting, Several, SmallModels, Span, grid, with_hold
+from ctid_cli.identification.candidates import Setting, Several, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Ranking, Searched
 from ctid_cli.identification.held_back import standing
 from ctid_cli.identification.initial_states import (
-    State,
     beginning_is_likely,
     changes_at_the_beginning_only,
     excited_after,
@@ -121,7 +120,7 @@ class _Choosing:
             delays, setting = narrower, confirmed
             ranking = self._grid(setting, delays)
         ranking = standing(ranking, self._held(setting))
-        while self.given.delays_given is None and _at_end(ranking, delays) and delays[1] < latest:
+        while delays[1] < latest and max(delays_of(ranking.best.fit.model)) > AT_END * delays[1]:
             delays = 0.0, _rounded(min(2.0 * delays[1], latest))
             ranking = standing(self._grid(setting, delays), self._held(setting))
         about = sentences.of_grid(ranking, delays, self.given, self.time_unit)
@@ -162,16 +161,6 @@ class _Choosing:
     def _held(self, setting: Setting) -> list[Record]:
         return [with_hold(record, setting.hold) for record in self.part]
 
-    def _small(
-        self,
-        records: list[Record],
-        span: Span,
-        delays: tuple[float, float],
-        near: AnyModel | None = None,
-        most: int = len(SMALL),
-    ) -> SmallModels:
-        return SmallModels(records, span, delays, most, near, self.several)
-
     # --- the range of the delay ------------------------------------------------------------------------
 
     def _delays(self) -> tuple[tuple[float, float], float]:
@@ -185,7 +174,9 @@ class _Choosing:
         latest = _rounded(min(max(LATEST * length, later), LATER * length))
         # Assuming rest may bias the delay; an estimated state does not.
         settings = self._settings(latest)[-1:]
-        models = self._small(self._common(settings, latest), self.span, (0.0, latest), most=2).compared(settings)
+        models = SmallModels(self._common(settings, latest), self.span, (0.0, latest), self.several, most=2).compared(
+            settings
+        )
         self._note(models)
         return self._range_of(models, (0.0, latest)), latest
 
@@ -211,9 +202,9 @@ class _Choosing:
         rests = [each for each in settings if each.initial_state == "rest"]
         if len(rests) > 1:
             # All samples determine the level before the record, mainly the first ones.
-            level = self._small(self.part, span, delays, near).compared(rests).best.options.input_before
+            level = SmallModels(self.part, span, delays, self.several, near).compared(rests).best.options.input_before
             settings = [each for each in settings if each.initial_state != "rest" or each.input_before == level]
-        models = self._small(self._common(settings, delays[1]), span, delays, near)
+        models = SmallModels(self._common(settings, delays[1]), span, delays, self.several, near)
         if self.given.offset is None:
             settings += [each._replace(offset="none") for each in settings]
         ranking = models.compared(settings)
@@ -247,43 +238,27 @@ class _Choosing:
 
     def _settings(self, latest: float) -> list[Setting]:
         """Return settings with the states that can be compared, with an offset."""
-        return [
-            Setting(self.first_hold, state, before, self.given.offset or "estimate")
-            for state, before in self._states(latest)
-        ]
-
-    def _states(self, latest: float) -> list[State]:
-        if not self.from_start:
-            return [("estimate", None)]
-        found = states_of(self.part, self.given)
-        determined = excited_after(self.part, latest)
-        return [state for state in found if state[0] != "estimate" or determined or len(found) == 1]
+        states: list[State] = states_of(self.part, self.given) if self.from_start else [("estimate", None)]
+        if len(states) > 1 and not excited_after(self.part, latest):
+            states = [state for state in states if state[0] != "estimate"]
+        offset = self.given.offset or "estimate"
+        return [Setting(self.first_hold, state, before, offset) for state, before in states]
 
     def _holds(self) -> list[Holds]:
         """Return the holds to compare; steps, and an input in a loop, count as held."""
-        if self.given.hold != "auto" or self._moves != {"continuous"}:
-            return [self.first_hold]
-        if any(record.feedback for record in self.records):
+        moves = {input_moves(each).kind for record in self.records for each in record.each_input}
+        if self.given.hold != "auto" or moves != {"continuous"} or any(record.feedback for record in self.records):
             return [self.first_hold]
         if not all(np.array_equal(one.t, record.t) for record in self.records for one in record.held.values()):
             return [self.records[0].hold]
         regular = all(record.interval is not None for record in self.part)
         return [hold for hold in get_args(Hold) if regular or hold != "band-limited"]
 
-    @property
-    def _moves(self) -> set[str]:
-        """Kinds of changes of the inputs."""
-        return {input_moves(each).kind for record in self.records for each in record.each_input}
-
     def _common(self, settings: Sequence[Setting], latest: float) -> list[Record]:
         """Return the records with the samples that all settings can use."""
         if all(setting.initial_state != "estimate" for setting in settings):
             return self.part
         return without_beginning(self.part, latest)
-
-
-def _at_end(ranking: Ranking, delays: tuple[float, float]) -> bool:
-    return max(delays_of(ranking.best.fit.model)) > AT_END * delays[1]
 
 
 def _rounded(delay: float) -> float:

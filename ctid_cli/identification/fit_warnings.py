@@ -1,7 +1,7 @@
 """Warnings of a fit: at most five sentences, the most important first."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,24 +37,13 @@ SLOW = 0.6
 LISTED = 3
 
 
-@dataclass(frozen=True)
-class FitWarning:
-    """An observation about a fit, with the remedy if one was tried and helped."""
-
-    observed: str
-    remedy: Remedy | None = None
-
-    def __str__(self) -> str:
-        return f"{self.observed}." if self.remedy is None else f"{self.observed}: {self.remedy}."
-
-
 def with_warnings(found: Identification, time_unit: str = "s") -> Identification:
     """Try changes of a fit on its records, and return it with its warnings."""
-    return replace(found, warnings=tuple(map(str, fit_warnings(found, time_unit))))
+    return replace(found, warnings=tuple(f"{text}." for text in fit_warnings(found, time_unit)))
 
 
-def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning]:
-    """Try changes of a fit, and return its warnings, the most important first."""
+def fit_warnings(found: Identification, time_unit: str = "s") -> list[str]:
+    """Return the warnings of a fit without their full stops, the most important first, and try changes of it."""
     fit, records = found.fit, found.records
     growing = [
         growth_time(record.t[use], record.y[use], signal.at(record.t[use]))
@@ -64,11 +53,11 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
     if all(np.isfinite(growing)):
         fastest = float(np.nanmin(growing))
         what = f"The output diverges: it grows by a factor of e every {fastest:.2g} {time_unit}, and the input does not"
-        return [FitWarning(f"{what}; an unstable plant is not among the models")]
+        return [f"{what}; an unstable plant is not among the models"]
     if fit.status in UNFINISHED:
         loop = ". In a loop the plant may be unstable: that needs the controller (--loop FILE)"
         unfinished = fit.status.value.removesuffix(".")
-        return [FitWarning(f"{unfinished}{loop * any(record.loop is not None for record in records)}")]
+        return [f"{unfinished}{loop * any(record.loop is not None for record in records)}"]
     detected = found.answer.seen
     suspicious = (
         fit.fit_percent < LOW_FIT
@@ -77,11 +66,11 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
     )
     suspicious |= not all(test.white and test.uncorrelated for test in found.tests)
     tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=detected)
-    named = [FitWarning(_observed(remedy, found, time_unit), remedy) for remedy in tried.remedies]
+    named = [f"{_observed(remedy, found, time_unit)}: {remedy}" for remedy in tried.remedies]
     remedied = {remedy.kind for remedy in tried.remedies}
     if not detected:
         no_model = f"No model: no response of the output to the input is detected ({probability(found.answer.p_value)})"
-        return [FitWarning(f"{no_model}. {found.answer.evidence[:-1]}"), *named]
+        return [f"{no_model}. {found.answer.evidence[:-1]}", *named]
     others = [*of_lost_poles(fit), *_of_residuals(found, remedied, time_unit)]
     if not named:
         # The search and the errors of an estimate that will change are not reported.
@@ -91,8 +80,7 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
             *of_search(fit, time_unit),
             *_of_uncertainty(found, time_unit),
         ]
-    failed = list(_of_validation(found))
-    return [*failed, *named, *(FitWarning(each) for each in dict.fromkeys(others))][:MOST]
+    return list(dict.fromkeys([*_of_validation(found), *named, *others]))[:MOST]
 
 
 def _used(found: Identification) -> Iterator[tuple[Record, BoolArray]]:
@@ -171,18 +159,14 @@ def _slow_pole(found: Identification, time_unit: str) -> str:
 # --- observations without a remedy -------------------------------------------------------------------
 
 
-def _of_validation(found: Identification) -> Iterator[FitWarning]:
+def _of_validation(found: Identification) -> Iterator[str]:
     fitted, other = found.fit.r2, found.validation
     if other is not None and (shared := found.seen_in_validation):
         what = f"{shared} of the {count(other.record.n_samples, 'sample')} of the validation record are those that"
-        yield FitWarning(
-            f"{what} the model was estimated from, so its fit there is no test; give a record without them"
-        )
+        yield f"{what} the model was estimated from, so its fit there is no test; give a record without them"
     if other is not None and other.r2 < 0.5 < fitted:
         what = f"The model explains {100 * fitted:.0f} % of the variance of the record it was estimated from, but only"
-        yield FitWarning(
-            f"{what} {100 * max(other.r2, 0.0):.0f} % of the validation record's: the model does not generalise"
-        )
+        yield f"{what} {100 * max(other.r2, 0.0):.0f} % of the validation record's: the model does not generalise"
 
 
 def _of_residuals(found: Identification, remedied: set[Kind], time_unit: str) -> Iterator[str]:

@@ -192,5 +192,5 @@ def test_feedback_that_is_known_is_no_warning():
 def test_of_a_search_that_did_not_end_nothing_else_is_said():
     found = identify(record_of(), FIRST_ORDER)
     unfinished = replace(found, fit=replace(found.fit, status=Status.MAX_ITERATIONS))
-    (said,) = fit_warnings(unfinished)
-    assert str(said).startswith("The iterations stopped at max_iterations")
+    (text,) = fit_warnings(unfinished)
+    assert text.startswith("The iterations stopped at max_iterations")
