@@ -20,6 +20,7 @@ from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Ranking, Searched
 from ctid_cli.identification.held_back import standing
 from ctid_cli.identification.initial_states import (
+    State,
     beginning_is_likely,
     changes_at_the_beginning_only,
     excited_after,
@@ -174,11 +175,10 @@ class _Choosing:
         latest = _rounded(min(max(LATEST * length, later), LATER * length))
         # Assuming rest may bias the delay; an estimated state does not.
         settings = self._settings(latest)[-1:]
-        models = SmallModels(self._common(settings, latest), self.span, (0.0, latest), self.several, most=2).compared(
-            settings
-        )
-        self._note(models)
-        return self._range_of(models, (0.0, latest)), latest
+        models = SmallModels(self._common(settings, latest), self.span, (0.0, latest), self.several, most=2)
+        ranking = models.compared(settings)
+        self._note(ranking)
+        return self._range_of(ranking, (0.0, latest)), latest
 
     def _note(self, models: Ranking) -> None:
         """Keep the delays of the best small model, from which later searches of several inputs start."""
