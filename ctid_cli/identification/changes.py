@@ -10,6 +10,7 @@ import numpy as np
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.estimation.optimum.best_model import Begin
 from ctid_cli.estimators.delay_profile import DelayProfile, InputModel, MeasuredFit
+from ctid_cli.identification.choice import fit_options
 from ctid_cli.identification.held_back import held_back_errors
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.models.several_inputs import delays_of, fractions_of
@@ -191,29 +192,7 @@ CHANGES: dict[Kind, Callable[[FittedOptions], Iterator[Change]]] = {
 }
 
 
-def typed(old: FittedOptions, new: FittedOptions) -> str:
+def option_of(old: FittedOptions, new: FittedOptions) -> str:
     """Return the options of ``ctid fit`` that turn one fit into another."""
-    before, after, words = old.options, new.options, list[str]()
-    pairs = {name: (own, old.each_input(before)[name]) for name, own in old.each_input(after).items()}
-    if len({_degrees(own) + _degrees(was) for own, was in pairs.values()}) == 1:
-        pairs = {"": next(iter(pairs.values()))}
-    for name, (own, was) in pairs.items():
-        of = f"{name}=" if name else ""
-        if own.delay_bounds != was.delay_bounds:
-            words.append("--delay {}{:g}:{:g}".format(of, *own.delay_bounds))
-        # A number of poles of one input would separate a common denominator.
-        of_poles = "" if name and after.common else of
-        if (own.poles, own.zeros) != (was.poles, was.zeros):
-            words += [f"--poles {of_poles}{own.poles}", f"--zeros {of}{own.zeros}"]
-        if own.integrators != was.integrators:
-            words.append(f"--integrators {of_poles}{own.integrators}")
-    for option in ("initial_state", "offset", "loss"):
-        if getattr(before, option) != getattr(after, option):
-            words.append(f"--{option.replace('_', '-')} {getattr(after, option)}")
-    if new.records[0].hold_options != old.records[0].hold_options:
-        words += [f"--hold {text}" for text in new.records[0].hold_options]
-    return " ".join(dict.fromkeys(words))
-
-
-def _degrees(options: DelayProfile) -> tuple[object, ...]:
-    return options.delay_bounds, options.poles, options.zeros, options.integrators
+    before = fit_options(old.options, old.records[0])
+    return " ".join(text for text in fit_options(new.options, new.records[0]) if text not in before)

@@ -173,21 +173,29 @@ class Choice:
 
     def words(self) -> list[str]:
         """Return the choice as options of ``ctid fit``."""
-        options, inputs = self.options, tuple[InputModel, ...]()
-        if isinstance(options, AdditiveOutputError):
-            found = ["--model", "additive", "--terms", terms_text(options.terms)]
-        else:
-            found = ["--poles", f"{options.poles}", "--zeros", f"{options.zeros}"]
-            inputs = options.inputs or ()
-        found += ["--integrators", f"{options.integrators}"] if options.integrators else []
-        for one in (None, *inputs):
-            bounds, of = (options.delay_bounds, "") if one is None else (one.delay_bounds, f"{one.name}=")
-            if bounds is not None:
-                low, high = bounds
-                found += ["--delay", f"{of}{low:g}:{high:g}" if low < high else f"{of}{low:g}"]
-        found += ["--initial-state", options.initial_state, "--offset", options.offset]
-        if options.initial_state == "rest" and options.offset != "remove":
-            before = options.input_before
-            found += ["--input-before", before if before == "first" else f"{before or 0.0:g}"]
-        found += ["--loss", options.loss] if options.loss != "squares" else []
-        return [*found, *(word for text in self.records[0].hold_options for word in ("--hold", text))]
+        return " ".join(fit_options(self.options, self.records[0])).split()
+
+
+def fit_options(options: Searched, record: Record) -> list[str]:
+    """Return the options of ``ctid fit`` for an estimator and the hold of a record; related ones are one text."""
+    found, inputs = [], tuple[InputModel, ...]()
+    if isinstance(options, AdditiveOutputError):
+        found.append(f"--model additive --terms {terms_text(options.terms)}")
+    else:
+        inputs = options.inputs or ()
+    for part in (options, *inputs):
+        of = f"{part.name}=" if isinstance(part, InputModel) else ""
+        if not isinstance(part, AdditiveOutputError):
+            degrees = (("poles", part.poles), ("zeros", part.zeros))
+            found.append(" ".join(f"--{name} {of}{number}" for name, number in degrees if number is not None))
+        if part.integrators:
+            found.append(f"--integrators {of}{part.integrators}")
+        if part.delay_bounds is not None:
+            low, high = part.delay_bounds
+            found.append(f"--delay {of}{low:g}:{high:g}" if low < high else f"--delay {of}{low:g}")
+    found += [f"--initial-state {options.initial_state}", f"--offset {options.offset}"]
+    if options.initial_state == "rest" and options.offset != "remove":
+        before = options.input_before
+        found.append(f"--input-before {before if before == 'first' else f'{before or 0.0:g}'}")
+    found += [f"--loss {options.loss}"] * (options.loss != "squares")
+    return [*filter(None, found), *(f"--hold {text}" for text in record.hold_options)]

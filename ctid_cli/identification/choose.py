@@ -214,7 +214,7 @@ class _Choosing:
         holds = self._holds()
         if len(holds) > 1:
             compared = models.compared([setting._replace(hold=hold) for hold in holds])
-            self.reasons.append(sentences.of_hold(compared))
+            self.reasons.append(sentences.of_setting(compared, "hold"))
             setting = setting._replace(hold=compared.best.hold)
         return setting
 
@@ -231,7 +231,7 @@ class _Choosing:
             options = models.best.options
             self.reasons.append(sentences.rest_assumed(options) if self.from_start else sentences.STATE_OF_PART)
         if self.given.offset is None:
-            self.reasons.append(sentences.of_offset(chosen))
+            self.reasons.append(sentences.of_setting(chosen, "offset"))
         return chosen.best.options
 
     # --- settings to compare ---------------------------------------------------------------------------

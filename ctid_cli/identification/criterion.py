@@ -91,6 +91,10 @@ class Candidate:
         zeros = ",".join(map(str, own)) if len(set(own)) > 1 else f"{own[0] if own else options.zeros}"
         return f"{options.poles}/{zeros}{integrators}"
 
+    def value(self, name: str) -> object:
+        """Return the hold, or an option."""
+        return self.hold if name == "hold" else getattr(self.options, name)
+
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
@@ -106,20 +110,12 @@ class Ranking:
 
     def of(self, **options: object) -> "Ranking | None":
         """Return the candidates with these options; None if there are none."""
-        found = [
-            each
-            for each in self.candidates
-            if all(getattr(each.options, name) == value for name, value in options.items())
-        ]
+        found = [each for each in self.candidates if all(each.value(name) == own for name, own in options.items())]
         return Ranking(tuple(found), self.noise) if found else None
 
     def runner_up(self, *names: str) -> Candidate | None:
         """Return the first candidate that is not better than the best and differs in a named option, or None."""
-
-        def key(each: Candidate) -> tuple[object, ...]:
-            return tuple(each.hold if name == "hold" else getattr(each.options, name) for name in names)
-
-        others = (each for each in self.candidates if key(each) != key(self.best))
+        others = (each for each in self.candidates if any(each.value(n) != self.best.value(n) for n in names))
         return next((each for each in others if each.criterion >= self.best.criterion), None)
 
 

@@ -1,7 +1,6 @@
 """Parts of long records that are used to choose settings."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,18 +15,10 @@ PART = 2500
 LIVELY = 0.5
 
 
-class Parts(NamedTuple):
-    """Parts of records."""
-
-    records: list[Record]
-    #: Whether they start at the beginning of the records.
-    from_start: bool
-
-
-def parts_of(records: Sequence[Record]) -> Parts:
-    """Return parts with at most ``PART`` samples in total."""
+def parts_of(records: Sequence[Record]) -> tuple[list[Record], bool]:
+    """Return parts with at most ``PART`` samples in total, and whether all start at the beginning of their records."""
     found = [_part(record, PART // len(records)) for record in records]
-    return Parts([record for record, _ in found], all(from_start for _, from_start in found))
+    return [record for record, _ in found], all(from_start for _, from_start in found)
 
 
 def _part(record: Record, most: int) -> tuple[Record, bool]:

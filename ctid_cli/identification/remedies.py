@@ -11,7 +11,7 @@ from ctid_cli.errors import CtidError
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.estimators.identification import Options
 from ctid_cli.identification.candidates import with_hold
-from ctid_cli.identification.changes import CHANGES, Change, FittedOptions, Kind, typed
+from ctid_cli.identification.changes import CHANGES, Change, FittedOptions, Kind, option_of
 from ctid_cli.identification.criterion import criteria_of
 from ctid_cli.identification.held_back import compared, long_enough
 from ctid_cli.inference.signal_features import residual_outliers
@@ -149,7 +149,7 @@ def _with_best(base: FittedOptions, kinds: Sequence[Kind], found: Trials) -> tup
         if best is not None:
             helpful.append(best)
         elif not found.remedies:
-            found.without_gain.extend(typed(base, one) for one in tried)
+            found.without_gain.extend(option_of(base, one) for one in tried)
     if not helpful:
         return base, ()
     remedy, changed = _simplest(helpful)
@@ -187,7 +187,7 @@ def _best(base: FittedOptions, kind: Kind, tried: Sequence[FittedOptions]) -> He
 def _helpful(base: FittedOptions, kind: Kind, changed: FittedOptions) -> Helpful | None:
     """Return a change as a remedy; None if it does not help."""
     fits = base.fit.fit_percent, changed.fit.fit_percent
-    made = kind, typed(base, changed), changed.options, changed.hold
+    made = kind, option_of(base, changed), changed.options, changed.hold
     try:
         # Another loss must improve the fit of the samples that are no outliers.
         clean = (kind == "loss" and without_outliers(base.records, base.fit)) or base.records
