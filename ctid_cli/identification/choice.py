@@ -14,6 +14,9 @@ from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import AskedHold, Hold, InitialState, InputBefore, LossKind, Offset
 from ctid_cli.text import probability
 
+#: Options that each of several inputs may have itself.
+OF_INPUTS = ("poles", "zeros", "integrators", "delay_bounds")
+
 
 @dataclass(frozen=True)
 class Given:
@@ -178,20 +181,23 @@ class Choice:
 
 def fit_options(options: Searched, record: Record) -> list[str]:
     """Return the options of ``ctid fit`` for an estimator and the hold of a record; related ones are one text."""
-    found, inputs = [], tuple[InputModel, ...]()
+    found, inputs = list[str](), tuple[InputModel, ...]()
     if isinstance(options, AdditiveOutputError):
         found.append(f"--model additive --terms {terms_text(options.terms)}")
     else:
         inputs = options.inputs or ()
+    # Options of all inputs that each of them has itself.
+    replaced = [name for name in OF_INPUTS if sum(getattr(one, name) is not None for one in inputs) == len(record.held)]
     for part in (options, *inputs):
         of = f"{part.name}=" if isinstance(part, InputModel) else ""
+        own = {name: getattr(part, name) for name in OF_INPUTS if of or name not in replaced}
         if not isinstance(part, AdditiveOutputError):
-            degrees = (("poles", part.poles), ("zeros", part.zeros))
+            degrees = ((name, own.get(name)) for name in ("poles", "zeros"))
             found.append(" ".join(f"--{name} {of}{number}" for name, number in degrees if number is not None))
-        if part.integrators:
+        if own.get("integrators"):
             found.append(f"--integrators {of}{part.integrators}")
-        if part.delay_bounds is not None:
-            low, high = part.delay_bounds
+        if own.get("delay_bounds") is not None:
+            low, high = own["delay_bounds"]
             found.append(f"--delay {of}{low:g}:{high:g}" if low < high else f"--delay {of}{low:g}")
     found += [f"--initial-state {options.initial_state}", f"--offset {options.offset}"]
     if options.initial_state == "rest" and options.offset != "remove":
