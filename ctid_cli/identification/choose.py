@@ -18,7 +18,7 @@ from ctid_cli.identification import sentences
 from ctid_cli.identification.candidates import Setting, Several, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Ranking, Searched
-from ctid_cli.identification.held_back import standing
+from ctid_cli.identification.held_back import without_overfitted
 from ctid_cli.identification.initial_states import (
     State,
     beginning_is_likely,
@@ -120,10 +120,10 @@ class _Choosing:
         if (narrower, confirmed) != (delays, setting):
             delays, setting = narrower, confirmed
             ranking = self._grid(setting, delays)
-        ranking = standing(ranking, self._held(setting))
+        ranking = without_overfitted(ranking, self._held(setting))
         while delays[1] < latest and max(delays_of(ranking.best.fit.model)) > AT_END * delays[1]:
             delays = 0.0, _rounded(min(2.0 * delays[1], latest))
-            ranking = standing(self._grid(setting, delays), self._held(setting))
+            ranking = without_overfitted(self._grid(setting, delays), self._held(setting))
         about = sentences.of_grid(ranking, delays, self.given, self.time_unit)
         return self._chosen(ranking.best.options, setting, ranking, about)
 

@@ -58,10 +58,10 @@ class Candidate:
         Value of the criterion; only differences between candidates are meaningful.
     criteria : InformationCriteria
         AICc, BIC and FPE of the innovations.
-    unseen : float
+    prediction_ratio : float
         Mean squared error of held-back blocks of the records, over that of the fit; NaN if it was not computed.
-    stands : bool
-        Whether ``unseen`` is similar to that of smaller structures.
+    predicts : bool
+        Whether ``prediction_ratio`` is similar to that of smaller structures.
     """
 
     options: Searched
@@ -70,15 +70,15 @@ class Candidate:
     size: int
     criterion: float = float("nan")
     criteria: InformationCriteria = field(default_factory=lambda: information_criteria(np.nan, 1, 0))
-    unseen: float = float("nan")
-    stands: bool = True
+    prediction_ratio: float = float("nan")
+    predicts: bool = True
 
     @property
     def is_admissible(self) -> bool:
-        """Whether the data determine it, no pole pair is at a bound of ``UNDAMPED``, and it stands."""
+        """Whether the data determine it, no pole pair is at a bound of ``UNDAMPED``, and it predicts."""
         box, held = self.fit.box, self.fit.held_poles
         undamped = box is not None and any(UNDAMPED.intersection(box.met_by(pole)) for pole in held)
-        return self.stands and self.fit.condition_number <= LARGEST_CONDITION and not undamped
+        return self.predicts and self.fit.condition_number <= LARGEST_CONDITION and not undamped
 
     @property
     def name(self) -> str:

@@ -103,7 +103,7 @@ def held_back_errors(options: DelayProfile, records: Sequence[Record], near: Beg
     return errors
 
 
-def standing(ranking: Ranking, records: Sequence[Record]) -> Ranking:
+def without_overfitted(ranking: Ranking, records: Sequence[Record]) -> Ranking:
     """Return structures in order, those last that are too large to predict held-back blocks.
 
     The best structure of each number of poles is checked: it is overfitted if its ratio of the squared error of
@@ -118,18 +118,20 @@ def standing(ranking: Ranking, records: Sequence[Record]) -> Ranking:
             best_of.setdefault(each.options.order, each)
     if len(best_of) < 2 or not long_enough(records):
         return ranking
-    checked = {order: replace(each, unseen=_unseen(each, records)) for order, each in best_of.items()}
+    checked = {
+        order: replace(each, prediction_ratio=_prediction_ratio(each, records)) for order, each in best_of.items()
+    }
     most = ranking.best.options.order
     while smaller := [each for order, each in checked.items() if order < most]:
-        if not checked[most].unseen > OPTIMISTIC * min(each.unseen for each in smaller):
+        if not checked[most].prediction_ratio > OPTIMISTIC * min(each.prediction_ratio for each in smaller):
             break
         most = min(smaller, key=lambda each: each.criterion).options.order
     replaced = {id(each): checked[order] for order, each in best_of.items()}
     found = [replaced.get(id(each), each) for each in ranking.candidates]
-    return replace(ranking, candidates=in_order([replace(each, stands=each.options.order <= most) for each in found]))
+    return replace(ranking, candidates=in_order([replace(each, predicts=each.options.order <= most) for each in found]))
 
 
-def _unseen(candidate: Candidate, records: Sequence[Record]) -> float:
+def _prediction_ratio(candidate: Candidate, records: Sequence[Record]) -> float:
     """Return the mean squared error of held-back blocks over that of the fit; infinity if a fit fails."""
     options, fit = candidate.options, candidate.fit
     assert isinstance(options, DelayProfile)

@@ -98,14 +98,16 @@ def of_range(delays: tuple[float, float], given: Given, time_unit: str) -> list[
 
 def _too_large(ranking: Ranking) -> list[str]:
     """Explain why the structure of least criterion was not chosen, if it predicts poorly."""
-    larger = [each for each in ranking.candidates if not each.stands and each.unseen == each.unseen]
+    larger = [
+        each for each in ranking.candidates if not each.predicts and each.prediction_ratio == each.prediction_ratio
+    ]
     if not larger:
         return []
     each, best = min(larger, key=lambda each: each.criterion), ranking.best
     named = f"{each.name} (criterion {best.criterion - each.criterion:.3g} lower)"
     return [
-        f"Not larger: in held-back blocks the squared error of {named} is {each.unseen:.2g} times that "
-        f"of its fit; that of {best.name} is {best.unseen:.2g} times."
+        f"Not larger: in held-back blocks the squared error of {named} is {each.prediction_ratio:.2g} times that "
+        f"of its fit; that of {best.name} is {best.prediction_ratio:.2g} times."
     ]
 
 

@@ -120,12 +120,12 @@ def test_the_grid_goes_on_while_more_poles_pay_against_white_noise():
     assert still_pays(ranked([*ranking.candidates, larger]), 4)
 
 
-@pytest.mark.parametrize(("unseen", "chosen"), [(1.5, 4), (2.5, 2)])
-def test_a_structure_that_predicts_far_worse_than_a_smaller_one_is_no_candidate(monkeypatch, unseen, chosen):
+@pytest.mark.parametrize(("ratio", "chosen"), [(1.5, 4), (2.5, 2)])
+def test_a_structure_that_predicts_far_worse_than_a_smaller_one_is_no_candidate(monkeypatch, ratio, chosen):
     # Blocks are predicted with this ratio of their squared error to that of the fit.
     record = record_of(SECOND)
     best = choose(record).ranking.best
-    sizes = {4: unseen, 3: 1.2, 2: 1.0}
+    sizes = {4: ratio, 3: 1.2, 2: 1.0}
     grid = [
         replace(best, options=replace(best.options, poles=poles), criterion=best.criterion + 10.0 * (k - 1))
         for k, poles in enumerate((4, 2, 3))
@@ -135,7 +135,7 @@ def test_a_structure_that_predicts_far_worse_than_a_smaller_one_is_no_candidate(
         return [np.full(record.n_samples, np.sqrt(sizes[options.poles] * best.fit.cost)) for record in records]
 
     monkeypatch.setattr(held_back, "held_back_errors", errors)
-    ranking = held_back.standing(Ranking(tuple(grid), ranked([best]).noise), [record])
+    ranking = held_back.without_overfitted(Ranking(tuple(grid), ranked([best]).noise), [record])
     assert ranking.best.options.poles == chosen
     assert len(ranking.candidates) == 3
     said = " ".join(of_grid(ranking, (0.0, 1.0), Given(), "s"))
