@@ -29,7 +29,7 @@ from ctid_cli.identification.initial_states import (
 )
 from ctid_cli.identification.parts import parts_of
 from ctid_cli.inference.input_response import analyse_response
-from ctid_cli.inference.record_facts import output_outliers
+from ctid_cli.inference.record_facts import gross_outliers
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.models.several_inputs import AnyModel, delays_of
 from ctid_cli.signals.held import Hold
@@ -94,7 +94,7 @@ class _Choosing:
         self.part, self.from_start = (records, True) if given.initial_state == "periodic" else parts_of(records)
         self.loss: LossKind = given.loss or "squares"
         if given.loss is None and given.noise_model == "white":
-            instants = [output_outliers(record) for record in self.part]
+            instants = [gross_outliers(record) for record in self.part]
             if any(instants):
                 self.loss = "tukey"
                 self.first_reasons.insert(0, sentences.of_outliers(sum(map(len, instants))))

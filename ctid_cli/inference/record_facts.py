@@ -20,7 +20,15 @@ from ctid_cli.inference.response_estimates import (
 from ctid_cli.inference.response_model import Signals, fit_response
 from ctid_cli.inference.response_test import LEVEL as NO_RESPONSE
 from ctid_cli.inference.response_test import response_test
-from ctid_cli.inference.signal_features import InputMoves, growth_time, input_moves, outliers, quantum, saturated
+from ctid_cli.inference.signal_features import (
+    InputMoves,
+    growth_time,
+    input_moves,
+    outliers,
+    quantum,
+    residual_outliers,
+    saturated,
+)
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
@@ -196,12 +204,18 @@ def _response_p_value(record: Record) -> float:
     return test.p_value
 
 
-def output_outliers(record: Record) -> tuple[float, ...]:
-    """Return the instants of the outliers of an output; none where the response cannot be modelled."""
-    present = record.y[record.valid]
-    if record.several or present.size < FEWEST_SAMPLES or np.ptp(present) == 0.0:
+def gross_outliers(record: Record) -> tuple[float, ...]:
+    """Return the instants of gross outliers of an output besides its response; none where that cannot be modelled."""
+    used = np.flatnonzero(record.valid)
+    if record.several or used.size < FEWEST_SAMPLES or np.ptp(record.y[used]) == 0.0:
         return ()
-    return () if input_moves(record).kind == "constant" else decompose(record).outliers
+    if input_moves(record).kind == "constant":
+        return ()
+    interval = float(np.median(np.diff(record.t)))
+    y = record.y[used] - np.median(record.y[used])
+    model = fit_response(Signals(record.t[used], y, record.input, interval))
+    _, rest = model.parts(slow_columns(model, slow_terms(model, ())))
+    return tuple(record.t[used[residual_outliers(rest)[0]]].tolist())
 
 
 def decompose(record: Record) -> Decomposition:
