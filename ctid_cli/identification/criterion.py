@@ -92,7 +92,18 @@ class Candidate:
         return f"{options.poles}/{zeros}{integrators}"
 
     def value(self, name: str) -> object:
-        """Return the hold, or an option."""
+        """Return the hold of the input, or an option.
+
+        Parameters
+        ----------
+        name : str
+            ``hold``, or the name of an option.
+
+        Returns
+        -------
+        object
+            Its value.
+        """
         return self.hold if name == "hold" else getattr(self.options, name)
 
 

@@ -18,7 +18,7 @@ from ctid_cli.inference.signal_features import residual_outliers
 from ctid_cli.signals.record import Record, beginning
 from ctid_cli.signals.treatment import Holds
 
-#: Most samples of all records on which changes are tried.
+#: Most samples of all records of one input on which changes are tried.
 MOST_SAMPLES = 10_000
 #: Least decrease of the criterion if it alone decides, very strong evidence by Kass and Raftery (1995).
 DECISIVE = 10.0
@@ -101,7 +101,9 @@ def tried_remedies(
     # sums of submodels take long to fit.
     if not isinstance(options, DelayProfile) or fit.noise is not None:
         return found
-    part = tuple(beginning(record, max(MOST_SAMPLES // len(records), 1)) for record in records)
+    # Number and time of the trials both grow with the number of inputs.
+    most = max(MOST_SAMPLES // (len(records) * len(records[0].held) ** 2), 1)
+    part = tuple(beginning(record, most) for record in records)
     base = FittedOptions(options, records[0].hold, part, fit)
     try:
         if any(map(is_not, part, records)):
