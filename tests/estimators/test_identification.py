@@ -92,7 +92,7 @@ def test_a_delay_at_its_bound_has_no_standard_error():
     assert np.isnan(delay.standard_error)
     assert delay.high == 0.4
     assert np.isfinite(by_name(result)["a1"].standard_error)
-    assert "The delay lies at the end of its range, 0.4 s: with --delay 0:" in result.warnings[0]
+    assert "The delay is at the end of its range, 0.4 s: with --delay 0:" in result.warnings[0]
 
 
 def test_a_zero_beside_a_delay_is_undetermined():
