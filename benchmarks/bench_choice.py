@@ -10,7 +10,8 @@ record, or an offset of the output; a binary input, one step, or a multisine; wh
 The error of a model is the root mean square error of its noise-free output for a new input, from rest, over the
 standard deviation of the true one, with the chosen hold. References are errors of the true structure with known hold,
 or their root mean square over five redraws of the noise if that is larger: `chosen` with the chosen treatment and
-range, `true` with the true treatment. Each record adds a line to FILE (JSON); existing ones are not computed again.
+range; `true` knows everything, with the true treatment and a range of the delay of 0 to 20 samples. Each record adds a
+line to FILE (JSON); existing ones are not computed again.
 
 Then step records with a lead of 1, 5 and 15 samples are compared with the true structure from rest.
 """
@@ -209,13 +210,13 @@ def _poles(rng: np.random.Generator, count: int, constant: float) -> Iterator[co
             k += 1
 
 
-def measured(case: Case) -> dict[str, object]:
-    """Choose a model, and compare it with the references."""
+def errors_of(case: Case) -> dict[str, object]:
+    """Return the error of the chosen model, and the references."""
     row: dict[str, object] = {"seed": case.seed, "number": case.number, "step": case.step}
     try:
         row["cpu_seconds"], choice = cpu(choose, case.record(0))
     except CtidError as error:
-        return {**row, "error": None, "said": str(error)}
+        return {**row, "error": None, "message": str(error)}
     found = choice.options.fit(choice.records, None)
     hold = choice.records[0].input.hold
     row |= {"error": case.error(found.model, hold), "command": choice.words(), "hold": hold}
@@ -257,25 +258,25 @@ def main() -> None:
     with given.file.open("a") as file:
         for case in (*cases, *leads):
             if (case.seed, case.number, case.step) not in known:
-                rows.append(measured(case))
+                rows.append(errors_of(case))
                 file.write(json.dumps(rows[-1]) + "\n")
                 file.flush()
     of_case = {(row["seed"], row["number"], row["step"]): row for row in rows}
 
-    def own(some: list[Case]) -> list[dict[str, object]]:
+    def rows_of(some: list[Case]) -> list[dict[str, object]]:
         return [of_case[case.seed, case.number, case.step] for case in some]
 
     print(f"{'records':16}{'against':8}{'number':>6}{'<= 1.25':>8}{'<= 2':>8}  [%]")
     for name, belongs in GROUPS.items():
         some = [case for case in cases if belongs(case)]
         for reference in ("chosen", "true") if some else ():
-            print(shares(name, own(some), reference))
-    far = sum(row["error"] is None or (row["error"] > 1 and row["chosen"] < 0.5) for row in own(cases))
+            print(shares(name, rows_of(some), reference))
+    far = sum(row["error"] is None or (row["error"] > 1 and row["chosen"] < 0.5) for row in rows_of(cases))
     print(f"errors above 1 where the reference is below .5, and refused records: {far}")
     for lead in LEADS:
         some = [case for case in leads if case.step == lead]
         if some:
-            print(shares(f"lead of {lead}", own(some), "true"))
+            print(shares(f"lead of {lead}", rows_of(some), "true"))
 
 
 if __name__ == "__main__":

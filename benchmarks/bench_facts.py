@@ -142,12 +142,12 @@ def noise_deviation(case):
     return 10 ** (-case.snr_db / 20)
 
 
-def alarms(record, beside):
+def alarms(record, parts):
     """Return the names of the reported faults."""
-    terms = {name for name in ("offset", "drift", "start") if getattr(beside, name).detected}
+    terms = {name for name in ("offset", "drift", "start") if getattr(parts, name).detected}
     others = {
-        "outliers": bool(beside.outliers),
-        "feedback": beside.feedback_p_value <= LEVEL,
+        "outliers": bool(parts.outliers),
+        "feedback": parts.feedback_p_value <= LEVEL,
         "saturation": saturated(record.y) > 0,
     }
     return terms | {name for name, found in others.items() if found}
@@ -174,14 +174,14 @@ def main(records, seed, every):
         pole = 0.0 if rng.random() < 0.5 else rng.uniform(0.5, 0.95)
         record = record_of(case, noise_deviation(case) * draw_noise(rng, case.t.size, pole))
         begin = time.process_time()
-        beside = decompose(record)
+        parts = decompose(record)
         seconds += time.process_time() - begin
-        stated = alarms(record, beside)
+        stated = alarms(record, parts)
         false.update(stated | ({"any"} if stated else set()))
-        covered["signal to noise"].append(held(beside.signal_to_noise, case.snr_db))
-        covered["delay"].append(held(beside.delay, case.system.delay))
+        covered["signal to noise"].append(held(parts.signal_to_noise, case.snr_db))
+        covered["delay"].append(held(parts.delay, case.system.delay))
         if not case.integrators:
-            covered["response time"].append(held(beside.response_time, true_response_time(case)))
+            covered["response time"].append(held(parts.response_time, true_response_time(case)))
         if number % every:
             continue
         for name, of in (("white", 0.0), ("AR(1) .9", 0.9)):

@@ -79,7 +79,7 @@ def noise(rng, samples):
     return found
 
 
-def made(rng, fault):
+def planted(rng, fault):
     """Return a simulated record with a planted fault; None if the system has nothing to leave out."""
     samples = int(np.exp(rng.uniform(np.log(300), np.log(1000))))
     integrating = int(fault == "integrator" or (fault != "integrator" and rng.random() < 0.25))
@@ -120,8 +120,8 @@ def made(rng, fault):
             return None
         typed = replace(right, integrators=0, zeros=min(zeros, right.poles - 1))
     else:
-        wild = np.flatnonzero(rng.random(int(FITTED * samples)) < 0.03)
-        y[wild] += rng.choice([-1.0, 1.0]) * rng.uniform(10, 30, wild.size) * max(scale, 0.1 * x.std())
+        outlying = np.flatnonzero(rng.random(int(FITTED * samples)) < 0.03)
+        y[outlying] += rng.choice([-1.0, 1.0]) * rng.uniform(10, 30, outlying.size) * max(scale, 0.1 * x.std())
     return Case(Record(t, y, HeldSignal(t, u, hold)), typed, right, fault)
 
 
@@ -132,7 +132,7 @@ def first_part(record):
     return Record(t, record.y[:n], HeldSignal(t, record.input.values[:n], record.input.hold), name=record.name)
 
 
-def judged(options, record):
+def fitted_and_tested(options, record):
     """Return the fit [%] of the last quarter by the fit to the rest, as in ``ctid fit``."""
     n = int(FITTED * record.n_samples)
     fit = options.fit(first_part(record))
@@ -152,17 +152,17 @@ def held(record, hold):
 
 def remedies_of(record, options):
     """Yield each remedy of a fit with its last quarter before and after."""
-    fit, before = judged(options, record)
+    fit, before = fitted_and_tested(options, record)
     part = first_part(record)
     began = time.process_time()
     found = tried_remedies([part], options, fit).remedies
     seconds = time.process_time() - began
-    fits = [before, *(judged(one.options, held(record, one.hold))[1] for one in found)]
+    fits = [before, *(fitted_and_tested(one.options, held(record, one.hold))[1] for one in found)]
     # Each remedy is added to those before it.
     return before, list(zip(found, fits[:-1], fits[1:], strict=True)), seconds
 
 
-def tell(found):
+def print_remedies(found):
     """Print remedies and their effect."""
     for one, worse, better in found:
         print(f"    {'ok ' if better > worse else 'BAD'} {better:.1f} {one}")
@@ -199,15 +199,15 @@ def main():
     made_of = dict.fromkeys(FAULTS, 0)
     while sum(made_of.values()) < given.records:
         fault = FAULTS[sum(made_of.values()) % len(FAULTS)]
-        case = made(rng, fault)
+        case = planted(rng, fault)
         if case is None:
             continue
         try:
             before, found, seconds = remedies_of(case.record, case.typed)
             _, right = (
-                judged(case.right, case.record)
+                fitted_and_tested(case.right, case.record)
                 if fault != "outliers"
-                else judged(replace(case.right, loss="tukey"), case.record)
+                else fitted_and_tested(replace(case.right, loss="tukey"), case.record)
             )
         except CtidError as error:
             print("refused:", error)
@@ -224,7 +224,7 @@ def main():
                 f"{fault} {case.record.n_samples} {before:.1f} -> {right:.1f}",
                 "costly" if right - before > COSTLY else "",
             )
-            tell(found)
+            print_remedies(found)
     if given.records:
         summary(rows, costly, spent)
     rows = []
@@ -239,7 +239,7 @@ def main():
                 continue
             rows += [(worse, better) for _, worse, better in found]
             print(f"{record.name}, {poles} poles: {before:.1f} % ({seconds:.1f} s)")
-            tell(found)
+            print_remedies(found)
     if rows:
         report(rows)
 

@@ -44,7 +44,7 @@ def check(
     result = RecordCheckResult(measured, facts)
     if result.worst != "problem":
         choice = choose(measured.record, Given(hold=hold), measured.time_unit or "s")
-        result = replace(result, command=command_of(measured, choice.words()) if choice.seen else None)
+        result = replace(result, command=command_of(measured, choice.words()) if choice.has_model else None)
     emit(result, form.form)
     if strict and result.worst == "problem":
         raise MismatchError(f"{file}: no model can be identified from this record as it is")

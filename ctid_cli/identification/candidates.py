@@ -44,11 +44,6 @@ class Setting(NamedTuple):
     input_before: InputBefore
     offset: Offset
 
-    @property
-    def state(self) -> tuple[InitialState, InputBefore]:
-        """State before the records."""
-        return self.initial_state, self.input_before
-
 
 class Several(NamedTuple):
     """Options of several inputs, which share a denominator."""
@@ -127,14 +122,13 @@ class Structures:
         setting: Setting,
         integrators: int,
         delays: tuple[float, float],
+        several: Several,
         near: Callable[[int, int], AnyModel | None] | None = None,
-        several: "Several | None" = None,
     ) -> "Structures":
         """Prepare records."""
         hold, state, before, offset = setting
-        least, several = int(not integrators), several or Several()
         options = DelayProfile(
-            *(least, 0, delays),
+            *(int(not integrators), 0, delays),
             initial_state=state,
             offset=offset,
             integrators=integrators,
@@ -255,12 +249,12 @@ class SmallModels:
         records: Sequence[Record],
         span: Span,
         delays: tuple[float, float],
-        most: int = len(SMALL),
+        several: Several,
         near: AnyModel | None = None,
-        several: Several | None = None,
+        most: int = len(SMALL),
     ) -> None:
-        self.records, self.span, self.delays, self.most, self.near = records, span, delays, most, near
-        self.several = several
+        self.records, self.span, self.delays, self.several = records, span, delays, several
+        self.near, self.most = near, most
         self._structures: dict[tuple[Setting, int], Structures] = {}
 
     def compared(self, settings: Sequence[Setting]) -> Ranking:
@@ -282,11 +276,11 @@ class SmallModels:
         """Prepare records; with another hold or offset, searches start at known models."""
         key = setting, integrators
         if key not in self._structures:
-            pairs = ((one, number) for one, number in self._structures if one.state == setting.state)
+            pairs = ((one, number) for one, number in self._structures if one[1:3] == setting[1:3])
             alike = next((self._structures[pair] for pair in pairs if pair[1] == integrators), None)
             model = self.near
             near = (lambda *_: model) if model is not None else None if alike is None else alike.model
-            self._structures[key] = Structures.of(self.records, *key, self.delays, near, self.several)
+            self._structures[key] = Structures.of(self.records, *key, self.delays, self.several, near)
         return self._structures[key]
 
 
@@ -295,11 +289,11 @@ def grid(
     setting: Setting,
     span: Span,
     delays: tuple[float, float],
-    several: Several | None = None,
+    several: Several,
 ) -> Ranking:
     """Fit structures of increasing order, until the best lies inside the grid or none is left."""
     families = [
-        Structures.of(records, setting, integrators, delays, None, several)
+        Structures.of(records, setting, integrators, delays, several)
         if span.modes is None
         else Sums.of(records, setting, integrators, delays)
         for integrators in span.integrators

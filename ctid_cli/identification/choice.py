@@ -14,6 +14,9 @@ from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import AskedHold, Hold, InitialState, InputBefore, LossKind, Offset
 from ctid_cli.text import probability
 
+#: Options that each of several inputs may have itself.
+OF_INPUTS = ("poles", "zeros", "integrators", "delay_bounds")
+
 
 @dataclass(frozen=True)
 class Given:
@@ -108,7 +111,7 @@ class Given:
     def check(self) -> None:
         """Raise an OptionError if given options contradict each other."""
         if self.modes is not None and (self.fixed or self.poles is not None or self.zeros is not None):
-            raise OptionError("modes", "modes choose the submodels: give no poles, zeros or known coefficients besides")
+            raise OptionError("modes", "modes choose the submodels: give no poles, zeros or known coefficients")
         delays = self.delay_bounds or (0.0, 1.0)
         (least, most), (fewest_zeros, _) = self.span.poles, self.span.zeros
         integrators = max(self.span.integrators)
@@ -158,36 +161,47 @@ class Choice:
     sentences: tuple[str, ...]
 
     @property
-    def seen(self) -> bool:
-        """Whether there is a model, that is, whether a response is detected."""
+    def has_model(self) -> bool:
+        """Whether a response is detected."""
         return self.answer.seen
 
     @property
-    def why_none(self) -> str:
+    def why_no_model(self) -> str:
         """Reason why there is no model."""
         evidence = f" {self.answer.evidence}" if self.answer.explained == self.answer.explained else ""
         return (
-            "There is no model here: the output is not seen to answer to the input "
+            "No model: no response of the output to the input is detected "
             f"({probability(self.answer.p_value)}).{evidence}"
         )
 
     def words(self) -> list[str]:
         """Return the choice as options of ``ctid fit``."""
-        options, inputs = self.options, tuple[InputModel, ...]()
-        if isinstance(options, AdditiveOutputError):
-            found = ["--model", "additive", "--terms", terms_text(options.terms)]
-        else:
-            found = ["--poles", f"{options.poles}", "--zeros", f"{options.zeros}"]
-            inputs = options.inputs or ()
-        found += ["--integrators", f"{options.integrators}"] if options.integrators else []
-        for one in (None, *inputs):
-            bounds, of = (options.delay_bounds, "") if one is None else (one.delay_bounds, f"{one.name}=")
-            if bounds is not None:
-                low, high = bounds
-                found += ["--delay", f"{of}{low:g}:{high:g}" if low < high else f"{of}{low:g}"]
-        found += ["--initial-state", options.initial_state, "--offset", options.offset]
-        if options.initial_state == "rest" and options.offset != "remove":
-            before = options.input_before
-            found += ["--input-before", before if before == "first" else f"{before or 0.0:g}"]
-        found += ["--loss", options.loss] if options.loss != "squares" else []
-        return [*found, *(word for text in self.records[0].hold_options for word in ("--hold", text))]
+        return " ".join(fit_options(self.options, self.records[0])).split()
+
+
+def fit_options(options: Searched, record: Record) -> list[str]:
+    """Return the options of ``ctid fit`` for an estimator and the hold of a record; related ones are one text."""
+    found, inputs = list[str](), tuple[InputModel, ...]()
+    if isinstance(options, AdditiveOutputError):
+        found.append(f"--model additive --terms {terms_text(options.terms)}")
+    else:
+        inputs = options.inputs or ()
+    # Options of all inputs that each of them has itself.
+    replaced = [name for name in OF_INPUTS if sum(getattr(one, name) is not None for one in inputs) == len(record.held)]
+    for part in (options, *inputs):
+        of = f"{part.name}=" if isinstance(part, InputModel) else ""
+        own = {name: getattr(part, name) for name in OF_INPUTS if of or name not in replaced}
+        if not isinstance(part, AdditiveOutputError):
+            degrees = ((name, own.get(name)) for name in ("poles", "zeros"))
+            found.append(" ".join(f"--{name} {of}{number}" for name, number in degrees if number is not None))
+        if own.get("integrators"):
+            found.append(f"--integrators {of}{part.integrators}")
+        if own.get("delay_bounds") is not None:
+            low, high = own["delay_bounds"]
+            found.append(f"--delay {of}{low:g}:{high:g}" if low < high else f"--delay {of}{low:g}")
+    found += [f"--initial-state {options.initial_state}", f"--offset {options.offset}"]
+    if options.initial_state == "rest" and options.offset != "remove":
+        before = options.input_before
+        found.append(f"--input-before {before if before == 'first' else f'{before or 0.0:g}'}")
+    found += [f"--loss {options.loss}"] * (options.loss != "squares")
+    return [*filter(None, found), *(f"--hold {text}" for text in record.hold_options)]

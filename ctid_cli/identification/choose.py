@@ -14,12 +14,11 @@ import numpy as np
 from ctid_cli.estimation.common import check_greatest_delay
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import answer_of
-from ctid_cli.estimators.measured_fit import MultiInputFit
 from ctid_cli.identification import sentences
-from ctid_cli.identification.candidates import SMALL, Setting, Several, SmallModels, Span, grid, with_hold
+from ctid_cli.identification.candidates import Setting, Several, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Ranking, Searched
-from ctid_cli.identification.held_back import standing
+from ctid_cli.identification.held_back import without_overfitted
 from ctid_cli.identification.initial_states import (
     State,
     beginning_is_likely,
@@ -28,14 +27,14 @@ from ctid_cli.identification.initial_states import (
     states_of,
     without_beginning,
 )
-from ctid_cli.identification.parts import FEW, MANY, parts_of
-from ctid_cli.identification.remedies import outliers_of
+from ctid_cli.identification.parts import parts_of
 from ctid_cli.inference.input_response import analyse_response
+from ctid_cli.inference.record_facts import gross_outliers
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.models.several_inputs import AnyModel, delays_of
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record, as_records
-from ctid_cli.signals.treatment import Holds
+from ctid_cli.signals.treatment import Holds, LossKind
 
 #: Greatest delay that is tried, and its limit if the record shows a later response, as shares of the record.
 LATEST, LATER = 0.1, 0.5
@@ -80,22 +79,7 @@ def choose(records: Record | Sequence[Record], given: Given | None = None, time_
     if given.delays_given is not None:
         for record in several:
             check_greatest_delay(record, given.delays_given[1])
-    choice = _Choosing(several, given, time_unit).choice()
-    if given.loss is not None or given.noise_model != "white" or isinstance(choice.ranking.best.fit, MultiInputFit):
-        return choice
-    best = choice.ranking.best
-    places = outliers_of(choice.fitted, best.options, best.fit)
-    if not any(off.any() for off in places):
-        return choice
-    times = [record.t[off] for record, off in zip(choice.fitted, places, strict=True)]
-    cleaned = [
-        replace(record, y=np.where(np.isin(record.t, instants), np.nan, record.y))
-        for record, instants in zip(several, times, strict=True)
-    ]
-    chosen = _Choosing(cleaned, replace(given, loss="tukey"), time_unit).choice()
-    left_out = sentences.of_outliers(sum(instants.size for instants in times))
-    held = tuple(with_hold(record, chosen.records[0].hold) for record in several)
-    return replace(chosen, records=held, sentences=(left_out, *chosen.sentences))
+    return _Choosing(several, given, time_unit).choice()
 
 
 class _Choosing:
@@ -105,13 +89,22 @@ class _Choosing:
         self.records, self.given, self.time_unit = records, given, time_unit
         drifts = len(given.span.integrators) > 1 and given.offset != "none" and changes_at_the_beginning_only(records)
         self.span = given.span._replace(integrators=(0,)) if drifts else given.span
-        self.about_span = [sentences.NO_INTEGRATOR] if drifts else []
-        whole = given.initial_state == "periodic"
-        self.few, self.from_start = (records, True) if whole else parts_of(records, FEW)
-        self.many, self.all_from_start = (records, True) if whole else parts_of(records, MANY)
+        self.first_reasons = [sentences.NO_INTEGRATOR] if drifts else []
+        # A periodic state is that of the whole record.
+        self.part, self.from_start = (records, True) if given.initial_state == "periodic" else parts_of(records)
+        self.loss: LossKind = given.loss or "squares"
+        if given.loss is None and given.noise_model == "white":
+            instants = [gross_outliers(record) for record in self.part]
+            if any(instants):
+                self.loss = "tukey"
+                self.first_reasons.insert(0, sentences.of_outliers(sum(map(len, instants))))
+                self.part = [
+                    replace(record, y=np.where(np.isin(record.t, at), np.nan, record.y))
+                    for record, at in zip(self.part, instants, strict=True)
+                ]
         self.several = Several(given.delays_of_inputs, not isinstance(given.zeros, int))
         self.first_hold: Holds = "zoh" if given.hold == "auto" else given.hold
-        self.said: list[str] = []
+        self.reasons: list[str] = []
 
     def choice(self) -> Choice:
         """Return the choice."""
@@ -127,12 +120,12 @@ class _Choosing:
         if (narrower, confirmed) != (delays, setting):
             delays, setting = narrower, confirmed
             ranking = self._grid(setting, delays)
-        ranking = standing(ranking, self._held(setting))
-        while self.given.delays_given is None and _at_end(ranking, delays) and delays[1] < latest:
+        ranking = without_overfitted(ranking, self._held(setting))
+        while delays[1] < latest and max(delays_of(ranking.best.fit.model)) > AT_END * delays[1]:
             delays = 0.0, _rounded(min(2.0 * delays[1], latest))
-            ranking = standing(self._grid(setting, delays), self._held(setting))
-        said = [*self.about_span, *sentences.of_grid(ranking, delays, self.given, self.time_unit)]
-        return self._chosen(ranking.best.options, setting, ranking, said)
+            ranking = without_overfitted(self._grid(setting, delays), self._held(setting))
+        about = sentences.of_grid(ranking, delays, self.given, self.time_unit)
+        return self._chosen(ranking.best.options, setting, ranking, about)
 
     def _typed(self, setting: Setting, delays: tuple[float, float]) -> Choice:
         """Return the choice if degrees of single inputs are given."""
@@ -142,42 +135,32 @@ class _Choosing:
         degrees = {"poles": given.poles, "zeros": given.zeros or 0, "integrators": given.integrators or 0}
         own: Any = {**degrees, "delay_bounds": delays, "inputs": given.inputs}
         options = replace(treated, **own)
-        said = sentences.of_range(delays, given, self.time_unit)
-        return self._chosen(options, setting, ranking, said)
+        about = sentences.of_range(delays, given, self.time_unit)
+        return self._chosen(options, setting, ranking, about)
 
     def _chosen(self, options: Searched, setting: Setting, ranking: Ranking, about: Sequence[str]) -> Choice:
         """Return a choice with its sentences."""
         best = ranking.best
-        options = replace(options, loss=self.given.loss or "squares", noise_model=self.given.noise_model)
+        options = replace(options, loss=self.loss, noise_model=self.given.noise_model)
         if isinstance(options, DelayProfile):
             options = replace(options, fixed=self.given.fixed, bounds=self.given.bounds, nested=True)
-        if not self.all_from_start:
+        if not self.from_start:
             options = replace(options, initial_state="estimate", input_before=None)
         fitted = tuple(self._held(setting))
         measured = best.options.prepare(fitted).laid_out
         answer = answer_of(best.options, measured.records, measured.used())
-        said = [*self.said, *about]
-        said += [sentences.of_criterion(ranking)] * bool(said)
+        reasons = [*self.first_reasons, *self.reasons, *about]
+        reasons += [sentences.of_criterion(ranking)] * bool(reasons)
         held = tuple(with_hold(record, setting.hold) for record in self.records)
-        return Choice(options, held, fitted, ranking, answer, tuple(said))
+        return Choice(options, held, fitted, ranking, answer, tuple(reasons))
 
     def _grid(self, setting: Setting, delays: tuple[float, float]) -> Ranking:
-        if not self.all_from_start:
+        if not self.from_start:
             setting = setting._replace(initial_state="estimate", input_before=None)
         return grid(self._held(setting), setting, self.span, delays, self.several)
 
     def _held(self, setting: Setting) -> list[Record]:
-        return [with_hold(record, setting.hold) for record in self.many]
-
-    def _small(
-        self,
-        records: list[Record],
-        span: Span,
-        delays: tuple[float, float],
-        near: AnyModel | None = None,
-        most: int = len(SMALL),
-    ) -> SmallModels:
-        return SmallModels(records, span, delays, most, near, self.several)
+        return [with_hold(record, setting.hold) for record in self.part]
 
     # --- the range of the delay ------------------------------------------------------------------------
 
@@ -186,15 +169,16 @@ class _Choosing:
         given = self.given.delays_given
         if given is not None:
             return given, given[1]
-        length = min(record.duration for record in self.few)
-        hints = [analyse_response(each).delay for record in self.few for each in record.each_input]
-        seen = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
-        latest = _rounded(min(max(LATEST * length, seen), LATER * length))
+        length = min(record.duration for record in self.part)
+        hints = [analyse_response(each).delay for record in self.part for each in record.each_input]
+        later = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
+        latest = _rounded(min(max(LATEST * length, later), LATER * length))
         # Assuming rest may bias the delay; an estimated state does not.
         settings = self._settings(latest)[-1:]
-        models = self._small(self._common(settings, latest), self.span, (0.0, latest), most=2).compared(settings)
-        self._note(models)
-        return self._range_of(models, (0.0, latest)), latest
+        models = SmallModels(self._common(settings, latest), self.span, (0.0, latest), self.several, most=2)
+        ranking = models.compared(settings)
+        self._note(ranking)
+        return self._range_of(ranking, (0.0, latest)), latest
 
     def _note(self, models: Ranking) -> None:
         """Keep the delays of the best small model, from which later searches of several inputs start."""
@@ -205,7 +189,7 @@ class _Choosing:
         """Return the range around the delay of the best model, within another; a given range unchanged."""
         if self.given.delays_given is not None:
             return delays
-        interval = max(float(np.median(np.diff(record.t))) for record in self.few)
+        interval = max(float(np.median(np.diff(record.t))) for record in self.part)
         reach = REACH * max(delays_of(ranking.best.fit.model)) + FURTHER * interval
         return 0.0, _rounded(min(max(reach, 2.0 * FURTHER * interval), delays[1]))
 
@@ -213,14 +197,14 @@ class _Choosing:
 
     def _setting(self, span: Span, delays: tuple[float, float], near: AnyModel | None = None) -> Setting:
         """Return the best state, offset and hold with structures of a span; searches may start at a known model."""
-        self.said = []
+        self.reasons = []
         settings = self._settings(delays[1])
         rests = [each for each in settings if each.initial_state == "rest"]
         if len(rests) > 1:
             # All samples determine the level before the record, mainly the first ones.
-            level = self._small(self.few, span, delays, near).compared(rests).best.options.input_before
+            level = SmallModels(self.part, span, delays, self.several, near).compared(rests).best.options.input_before
             settings = [each for each in settings if each.initial_state != "rest" or each.input_before == level]
-        models = self._small(self._common(settings, delays[1]), span, delays, near)
+        models = SmallModels(self._common(settings, delays[1]), span, delays, self.several, near)
         if self.given.offset is None:
             settings += [each._replace(offset="none") for each in settings]
         ranking = models.compared(settings)
@@ -230,7 +214,7 @@ class _Choosing:
         holds = self._holds()
         if len(holds) > 1:
             compared = models.compared([setting._replace(hold=hold) for hold in holds])
-            self.said.append(sentences.of_hold(compared))
+            self.reasons.append(sentences.of_setting(compared, "hold"))
             setting = setting._replace(hold=compared.best.hold)
         return setting
 
@@ -240,57 +224,41 @@ class _Choosing:
         chosen = models
         if rest is not None and estimated is not None:
             at_rest = rest.best.criterion <= estimated.best.criterion + TIE
-            likely = not at_rest or beginning_is_likely(rest.best, models.noise, self.few, length)
+            likely = not at_rest or beginning_is_likely(rest.best, models.noise, self.part, length)
             chosen = rest if at_rest and likely else estimated
-            self.said.append(sentences.of_state(rest.best, estimated.best, likely))
+            self.reasons.append(sentences.of_state(rest.best, estimated.best, likely))
         elif self.given.initial_state is None:
             options = models.best.options
-            self.said.append(sentences.rest_assumed(options) if self.from_start else sentences.STATE_OF_PART)
+            self.reasons.append(sentences.rest_assumed(options) if self.from_start else sentences.STATE_OF_PART)
         if self.given.offset is None:
-            self.said.append(sentences.of_offset(chosen))
+            self.reasons.append(sentences.of_setting(chosen, "offset"))
         return chosen.best.options
 
     # --- settings to compare ---------------------------------------------------------------------------
 
     def _settings(self, latest: float) -> list[Setting]:
         """Return settings with the states that can be compared, with an offset."""
-        return [
-            Setting(self.first_hold, state, before, self.given.offset or "estimate")
-            for state, before in self._states(latest)
-        ]
-
-    def _states(self, latest: float) -> list[State]:
-        if not self.from_start:
-            return [("estimate", None)]
-        found = states_of(self.few, self.given)
-        determined = excited_after(self.few, latest)
-        return [state for state in found if state[0] != "estimate" or determined or len(found) == 1]
+        states: list[State] = states_of(self.part, self.given) if self.from_start else [("estimate", None)]
+        if len(states) > 1 and not excited_after(self.part, latest):
+            states = [state for state in states if state[0] != "estimate"]
+        offset = self.given.offset or "estimate"
+        return [Setting(self.first_hold, state, before, offset) for state, before in states]
 
     def _holds(self) -> list[Holds]:
         """Return the holds to compare; steps, and an input in a loop, count as held."""
-        if self.given.hold != "auto" or self._moves != {"continuous"}:
-            return [self.first_hold]
-        if any(record.feedback for record in self.records):
+        moves = {input_moves(each).kind for record in self.records for each in record.each_input}
+        if self.given.hold != "auto" or moves != {"continuous"} or any(record.feedback for record in self.records):
             return [self.first_hold]
         if not all(np.array_equal(one.t, record.t) for record in self.records for one in record.held.values()):
             return [self.records[0].hold]
-        regular = all(record.interval is not None for record in self.few)
+        regular = all(record.interval is not None for record in self.part)
         return [hold for hold in get_args(Hold) if regular or hold != "band-limited"]
-
-    @property
-    def _moves(self) -> set[str]:
-        """Kinds of changes of the inputs."""
-        return {input_moves(each).kind for record in self.records for each in record.each_input}
 
     def _common(self, settings: Sequence[Setting], latest: float) -> list[Record]:
         """Return the records with the samples that all settings can use."""
         if all(setting.initial_state != "estimate" for setting in settings):
-            return self.few
-        return without_beginning(self.few, latest)
-
-
-def _at_end(ranking: Ranking, delays: tuple[float, float]) -> bool:
-    return max(delays_of(ranking.best.fit.model)) > AT_END * delays[1]
+            return self.part
+        return without_beginning(self.part, latest)
 
 
 def _rounded(delay: float) -> float:

@@ -59,10 +59,10 @@ class Candidate:
         Value of the criterion; only differences between candidates are meaningful.
     criteria : InformationCriteria
         AICc, BIC and FPE of the innovations.
-    unseen : float
+    prediction_ratio : float
         Mean squared error of held-back blocks of the records, over that of the fit; NaN if it was not computed.
-    stands : bool
-        Whether ``unseen`` is similar to that of smaller structures.
+    predicts : bool
+        Whether ``prediction_ratio`` is similar to that of smaller structures.
     """
 
     options: Searched
@@ -71,15 +71,15 @@ class Candidate:
     size: int
     criterion: float = float("nan")
     criteria: InformationCriteria = field(default_factory=lambda: information_criteria(np.nan, 1, 0))
-    unseen: float = float("nan")
-    stands: bool = True
+    prediction_ratio: float = float("nan")
+    predicts: bool = True
 
     @property
     def is_admissible(self) -> bool:
-        """Whether the data determine it, no pole pair is at a bound of ``UNDAMPED``, and it stands."""
+        """Whether the data determine it, no pole pair is at a bound of ``UNDAMPED``, and it predicts."""
         box, held = self.fit.box, self.fit.held_poles
         undamped = box is not None and any(UNDAMPED.intersection(box.met_by(pole)) for pole in held)
-        return self.stands and self.fit.condition_number <= LARGEST_CONDITION and not undamped
+        return self.predicts and self.fit.condition_number <= LARGEST_CONDITION and not undamped
 
     @property
     def name(self) -> str:
@@ -91,6 +91,21 @@ class Candidate:
         own = [options.zeros if one.zeros is None else one.zeros for one in options.inputs or ()]
         zeros = ",".join(map(str, own)) if len(set(own)) > 1 else f"{own[0] if own else options.zeros}"
         return f"{options.poles}/{zeros}{integrators}"
+
+    def value(self, name: str) -> object:
+        """Return the hold of the input, or an option.
+
+        Parameters
+        ----------
+        name : str
+            ``hold``, or the name of an option.
+
+        Returns
+        -------
+        object
+            Its value.
+        """
+        return self.hold if name == "hold" else getattr(self.options, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,20 +122,12 @@ class Ranking:
 
     def of(self, **options: object) -> "Ranking | None":
         """Return the candidates with these options; None if there are none."""
-        found = [
-            each
-            for each in self.candidates
-            if all(getattr(each.options, name) == value for name, value in options.items())
-        ]
+        found = [each for each in self.candidates if all(each.value(name) == own for name, own in options.items())]
         return Ranking(tuple(found), self.noise) if found else None
 
     def runner_up(self, *names: str) -> Candidate | None:
         """Return the first candidate that is not better than the best and differs in a named option, or None."""
-
-        def key(each: Candidate) -> tuple[object, ...]:
-            return tuple(each.hold if name == "hold" else getattr(each.options, name) for name in names)
-
-        others = (each for each in self.candidates if key(each) != key(self.best))
+        others = (each for each in self.candidates if any(each.value(n) != self.best.value(n) for n in names))
         return next((each for each in others if each.criterion >= self.best.criterion), None)
 
 
@@ -128,12 +135,12 @@ def ranked(candidates: Sequence[Candidate]) -> Ranking:
     """Rank candidates by their criterion; all must have been fitted to the same samples."""
     closest = min(candidates, key=lambda each: (not each.is_admissible, each.fit.cost))
     noise = noise_of(closest.fit.residuals)
-    return Ranking(in_order([_judged(each, noise) for each in candidates]), noise)
+    return Ranking(in_order([_with_criterion(each, noise) for each in candidates]), noise)
 
 
-def in_order(judged: Sequence[Candidate]) -> tuple[Candidate, ...]:
+def in_order(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
     """Return candidates by increasing criterion, inadmissible ones last."""
-    return tuple(sorted(judged, key=lambda each: (not each.is_admissible, each.criterion)))
+    return tuple(sorted(candidates, key=lambda each: (not each.is_admissible, each.criterion)))
 
 
 def criteria_of(models: Sequence[Errors], parameters: Sequence[int]) -> list[float]:
@@ -151,7 +158,7 @@ def noise_of(residuals: Sequence[Array]) -> NoiseModel:
     return fit_noise_model(residuals, penalty=float(np.log(sum(block.size for block in residuals))))
 
 
-def _judged(candidate: Candidate, noise: NoiseModel) -> Candidate:
+def _with_criterion(candidate: Candidate, noise: NoiseModel) -> Candidate:
     fit, size = candidate.fit, candidate.size
     count = innovations_count(fit.residuals, noise)
     squared = squared_innovations(fit.residuals, [psi @ fit.tangent for psi in fit.sensitivities], noise)

@@ -1,7 +1,7 @@
 """Warnings of a fit: at most five sentences, the most important first."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,7 +9,9 @@ from ctid_cli.arrays import BoolArray
 from ctid_cli.estimators.identification import Identification, unsafe_intervals
 from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
 from ctid_cli.estimators.reported_parameters import delay_names, free_directions
-from ctid_cli.identification.remedies import Kind, Remedy, Trials, tried_remedies
+from ctid_cli.identification.changes import Kind
+from ctid_cli.identification.remedies import Remedy, Trials, tried_remedies
+from ctid_cli.identification.sentences import spelled
 from ctid_cli.inference.covariance import condition_number, describe_conditioning
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, input_dependence
@@ -36,24 +38,13 @@ SLOW = 0.6
 LISTED = 3
 
 
-@dataclass(frozen=True)
-class FitWarning:
-    """An observation about a fit, with the remedy if one was tried and helped."""
-
-    observed: str
-    remedy: Remedy | None = None
-
-    def __str__(self) -> str:
-        return f"{self.observed}." if self.remedy is None else f"{self.observed}: {self.remedy}."
-
-
 def with_warnings(found: Identification, time_unit: str = "s") -> Identification:
     """Try changes of a fit on its records, and return it with its warnings."""
-    return replace(found, warnings=tuple(map(str, fit_warnings(found, time_unit))))
+    return replace(found, warnings=tuple(f"{text}." for text in fit_warnings(found, time_unit)))
 
 
-def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning]:
-    """Try changes of a fit, and return its warnings, the most important first."""
+def fit_warnings(found: Identification, time_unit: str = "s") -> list[str]:
+    """Return the warnings of a fit without their full stops, the most important first, and try changes of it."""
     fit, records = found.fit, found.records
     growing = [
         growth_time(record.t[use], record.y[use], signal.at(record.t[use]))
@@ -63,28 +54,25 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
     if all(np.isfinite(growing)):
         fastest = float(np.nanmin(growing))
         what = f"The output diverges: it grows by a factor of e every {fastest:.2g} {time_unit}, and the input does not"
-        return [FitWarning(f"{what}; an unstable plant is not among the models")]
+        return [f"{what}; an unstable plant is not among the models"]
     if fit.status in UNFINISHED:
         loop = ". In a loop the plant may be unstable: that needs the controller (--loop FILE)"
         unfinished = fit.status.value.removesuffix(".")
-        return [FitWarning(f"{unfinished}{loop * any(record.loop is not None for record in records)}")]
-    seen = found.answer.seen
+        return [f"{unfinished}{loop * any(record.loop is not None for record in records)}"]
+    detected = found.answer.seen
     suspicious = (
         fit.fit_percent < LOW_FIT
         or fit.status is not Status.CONVERGED
         or len(found.tests) < len(records) * len(delays_of(fit.model))
     )
     suspicious |= not all(test.white and test.uncorrelated for test in found.tests)
-    # Remedies compare output-error fits only.
-    tried = Trials([], [])
-    if fit.noise is None and not isinstance(fit, MultiInputFit):
-        tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=seen)
-    named = [FitWarning(_observed(remedy, found, time_unit), remedy) for remedy in tried.remedies]
-    mended = {remedy.kind for remedy in tried.remedies}
-    if not seen:
-        no_model = f"No model: the output is not seen to respond to the input ({probability(found.answer.p_value)})"
-        return [FitWarning(f"{no_model}. {found.answer.evidence[:-1]}"), *named]
-    others = [*of_lost_poles(fit), *_of_residuals(found, mended, time_unit)]
+    tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=detected)
+    named = [f"{_observed(remedy, found, time_unit)}: {remedy}" for remedy in tried.remedies]
+    remedied = {remedy.kind for remedy in tried.remedies}
+    if not detected:
+        no_model = f"No model: no response of the output to the input is detected ({probability(found.answer.p_value)})"
+        return [f"{no_model}. {found.answer.evidence[:-1]}", *named]
+    others = [*of_lost_poles(fit), *_of_residuals(found, remedied, time_unit)]
     if not named:
         # The search and the errors of an estimate that will change are not reported.
         others += [
@@ -93,8 +81,7 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
             *of_search(fit, time_unit),
             *_of_uncertainty(found, time_unit),
         ]
-    failed = list(_of_validation(found))
-    return [*failed, *named, *(FitWarning(each) for each in dict.fromkeys(others))][:MOST]
+    return list(dict.fromkeys([*_of_validation(found), *named, *others]))[:MOST]
 
 
 def _used(found: Identification) -> Iterator[tuple[Record, BoolArray]]:
@@ -113,14 +100,14 @@ def _observed(remedy: Remedy, found: Identification, time_unit: str) -> str:
         return f"The input is taken with --hold {' --hold '.join(found.records[0].hold_options)}"
     if remedy.kind == "treatment":
         return f"The fit is made with --initial-state {options.initial_state} --offset {options.offset}"
+    if remedy.kind == "delay" and (ends := [each for each in _delays_at_ends(fit, time_unit) if "end of" in each]):
+        return ends[0]
     low, high = options.delay_bounds
-    if remedy.kind == "delay" and fit.status is Status.DELAY_AT_BOUND:
-        return f"The delay lies at the end of its range, {fit.model.delay:.4g} {time_unit}"
     if remedy.kind == "delay" and low == high:
         return f"The delay is taken as {low:g} {time_unit}"
-    if getattr(remedy.options, "integrators", 0) and (slow := _slow_pole(found, time_unit)):
+    if "--integrators" in remedy.option and (slow := _slow_pole(found, time_unit)):
         return slow
-    return _dependence(found) or f"The model has {count(options.poles, 'pole')} and {count(options.zeros, 'zero')}"
+    return _dependence(found) or f"The model has {spelled(options)}"
 
 
 def _dependence(found: Identification, least: float = 0.05) -> str:
@@ -173,24 +160,22 @@ def _slow_pole(found: Identification, time_unit: str) -> str:
 # --- observations without a remedy -------------------------------------------------------------------
 
 
-def _of_validation(found: Identification) -> Iterator[FitWarning]:
+def _of_validation(found: Identification) -> Iterator[str]:
     fitted, other = found.fit.r2, found.validation
-    if other is not None and (seen := found.seen_in_validation):
-        what = f"{seen} of the {count(other.record.n_samples, 'sample')} of the validation record are those that"
-        yield FitWarning(
-            f"{what} the model was estimated from, so its fit there is no test; give a record without them"
-        )
+    if other is not None and (shared := found.seen_in_validation):
+        what = f"{shared} of the {count(other.record.n_samples, 'sample')} of the validation record are those that"
+        yield f"{what} the model was estimated from, so its fit there is no test; give a record without them"
     if other is not None and other.r2 < 0.5 < fitted:
         what = f"The model explains {100 * fitted:.0f} % of the variance of the record it was estimated from, but only"
-        yield FitWarning(f"{what} {100 * max(other.r2, 0.0):.0f} % of the validation record's: it does not carry over")
+        yield f"{what} {100 * max(other.r2, 0.0):.0f} % of the validation record's: the model does not generalise"
 
 
-def _of_residuals(found: Identification, mended: set[Kind], time_unit: str) -> Iterator[str]:
+def _of_residuals(found: Identification, remedied: set[Kind], time_unit: str) -> Iterator[str]:
     """Yield warnings about residuals and outputs."""
-    if not mended & {"structure", "delay", "hold"} and (what := _dependence(found, DEPENDENT)):
+    if not remedied & {"structure", "delay", "hold"} and (what := _dependence(found, DEPENDENT)):
         yield f"{what}: {AHEAD if 'later values' in what else 'the model misses a part of the response'}"
     outliers = _outliers(found, time_unit)
-    if outliers and "loss" not in mended:
+    if outliers and "loss" not in remedied:
         yield outliers
     share = max(saturated(record.y[record.valid]) for record in found.records)
     if share:
@@ -208,13 +193,13 @@ def _of_residuals(found: Identification, mended: set[Kind], time_unit: str) -> I
             input_dependence(e, x, psi, t, one, delay)
             for one, delay in zip(acting.each_input, delays_of(fit.model), strict=True)
         ]
-        seen = min(filter(None, dependences), key=lambda each: each.feedback_p_value, default=None)
-        if seen is None or seen.feedback_share < FEEDBACK_SHARE:
+        clearest = min(filter(None, dependences), key=lambda each: each.feedback_p_value, default=None)
+        if clearest is None or clearest.feedback_share < FEEDBACK_SHARE:
             continue
         # Missed dynamics may correlate residuals with later inputs too.
-        if seen.feedback_p_value < min(FED_BACK, seen.pole_p_value):
+        if clearest.feedback_p_value < min(FED_BACK, clearest.pole_p_value):
             what = "The input follows earlier residuals" if acting is record else "The reference follows the output"
-            where = f"{what} ({probability(seen.feedback_p_value)})"
+            where = f"{what} ({probability(clearest.feedback_p_value)})"
             yield f"{where}, as in a loop, where noise biases the estimate, or as if the output is ahead of the input"
 
 
@@ -247,20 +232,24 @@ def of_search(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
         met = () if fit.box is None else fit.box.limits_met(fit.held_poles)
         why = "".join(f"; the {limit.what} is {value:.4g}: {limit.meaning}" for _, limit, value in met)
         yield f"Held at the border of the admissible models: {held} (poles, rad/{time_unit}){why}"
-    if fit.status is Status.DELAY_AT_BOUND:
-        names, delays = delay_names(fit), delays_of(fit.model)
-        for name, delay in zip(names, delays, strict=True):
-            if name in fit.parameter_names and not fit.tangent[fit.parameter_names.index(name)].any():
-                where = f"end of its range, {delay:.4g} {time_unit}" if delay else "least possible, 0"
-                of = f" of {name.removesuffix('_delay')}" * (len(names) > 1)
-                yield f"The delay{of} is at the {where}, and has no standard error"
+    yield from (f"{where}, and has no standard error" for where in _delays_at_ends(fit, time_unit))
+
+
+def _delays_at_ends(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
+    """Yield which delays are at the end of their range."""
+    names = delay_names(fit)
+    for name, delay in zip(names, delays_of(fit.model), strict=True) if fit.status is Status.DELAY_AT_BOUND else ():
+        if name in fit.parameter_names and not fit.tangent[fit.parameter_names.index(name)].any():
+            where = f"end of its range, {delay:.4g} {time_unit}" if delay else "least possible, 0"
+            of = f" of {name.removesuffix('_delay')}" * (len(names) > 1)
+            yield f"The delay{of} is at the {where}"
 
 
 def of_lost_poles(fit: MeasuredFit) -> Iterator[str]:
     """Yield that the model has fewer poles than specified."""
     if lost := fit.poles_at_infinity:
         gone = f"{'it has' if lost == 1 else 'they have'} run to infinity, where the cost is least"
-        yield f"The model has {count(lost, 'pole')} fewer than asked for: {gone}"
+        yield f"The model has {count(lost, 'pole')} fewer than specified: {gone}"
 
 
 def of_conditioning(fit: MeasuredFit, known: Uncertainty) -> Iterator[str]:
@@ -274,8 +263,8 @@ def of_conditioning(fit: MeasuredFit, known: Uncertainty) -> Iterator[str]:
         names.append(fit.parameter_names[place] if own else f"pole {len(names) + 1}")
         any_value = names[-1].startswith("a") and not fit.signs_known
         values.append(np.inf if any_value else fit.theta[place])
-    told = describe_conditioning(known.free_covariance, np.array(values), names, condition_number(hessian), hessian)
-    yield from (each.removesuffix(".") for each in told)
+    found = describe_conditioning(known.free_covariance, np.array(values), names, condition_number(hessian), hessian)
+    yield from (each.removesuffix(".") for each in found)
 
 
 def _of_uncertainty(found: Identification, time_unit: str) -> Iterator[str]:

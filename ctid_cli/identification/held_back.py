@@ -7,15 +7,13 @@ import numpy as np
 
 from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import CtidError
+from ctid_cli.estimation.optimum.best_model import Begin
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.identification.criterion import Candidate, Ranking, in_order
 from ctid_cli.inference.criteria import percent_from_r_squared
-from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record
 
-#: Start of a fit: a denominator without integrators, and a delay [s].
-Near = tuple[Array, float]
 #: Blocks of all records, each held back once, and groups of blocks that are held back together: the last group has the
 #: ends of the records. The standard error of ten differences has a relative error of 24 %.
 BLOCKS, FOLDS = 10, 5
@@ -78,25 +76,18 @@ def long_enough(records: Sequence[Record]) -> bool:
     """Return whether blocks have enough samples, and the input moves in most of them."""
     moving = []
     for record, numbers in zip(records, block_numbers(records), strict=True):
-        u = record.input.at(record.t)
         for block in range(_blocks_each(records)):
             inside = numbers == block
             if np.count_nonzero(inside & record.valid) < SHORTEST:
                 return False
-            moving.append(np.ptp(u[inside]) > 0.0)
+            moving.append(any(np.ptp(signal.at(record.t[inside])) > 0.0 for signal in record.held.values()))
     return float(np.mean(moving)) >= MOVING
 
 
-def near_model(model: TransferFunction, integrators: int) -> Near:
-    """Return the start of a fit at a model."""
-    return model.denominator[: model.denominator.size - integrators], model.delay
-
-
-def held_back_errors(options: DelayProfile, records: Sequence[Record], near: Near) -> list[Array]:
+def held_back_errors(options: DelayProfile, records: Sequence[Record], near: Begin) -> list[Array]:
     """Return the output errors of all blocks, each from a fit without its outputs; NaN elsewhere, each of shape (N,).
 
-    Input and state are simulated through a held-back block. Fits start at the denominator and delay of the fit to the
-    whole records.
+    Input and state are simulated through a held-back block. Fits start at that to the whole records.
     """
     whole, folds = options.prepare(records).laid_out, _folds(records)
     errors = [np.full(record.n_samples, np.nan) for record in records]
@@ -112,7 +103,7 @@ def held_back_errors(options: DelayProfile, records: Sequence[Record], near: Nea
     return errors
 
 
-def standing(ranking: Ranking, records: Sequence[Record]) -> Ranking:
+def without_overfitted(ranking: Ranking, records: Sequence[Record]) -> Ranking:
     """Return structures in order, those last that are too large to predict held-back blocks.
 
     The best structure of each number of poles is checked: it is overfitted if its ratio of the squared error of
@@ -127,23 +118,26 @@ def standing(ranking: Ranking, records: Sequence[Record]) -> Ranking:
             best_of.setdefault(each.options.order, each)
     if len(best_of) < 2 or not long_enough(records):
         return ranking
-    seen = {order: replace(each, unseen=_unseen(each, records)) for order, each in best_of.items()}
+    checked = {
+        order: replace(each, prediction_ratio=_prediction_ratio(each, records)) for order, each in best_of.items()
+    }
     most = ranking.best.options.order
-    while smaller := [each for order, each in seen.items() if order < most]:
-        if not seen[most].unseen > OPTIMISTIC * min(each.unseen for each in smaller):
+    while smaller := [each for order, each in checked.items() if order < most]:
+        if not checked[most].prediction_ratio > OPTIMISTIC * min(each.prediction_ratio for each in smaller):
             break
         most = min(smaller, key=lambda each: each.criterion).options.order
-    looked_at = {id(each): seen[order] for order, each in best_of.items()}
-    found = [looked_at.get(id(each), each) for each in ranking.candidates]
-    return replace(ranking, candidates=in_order([replace(each, stands=each.options.order <= most) for each in found]))
+    replaced = {id(each): checked[order] for order, each in best_of.items()}
+    found = [replaced.get(id(each), each) for each in ranking.candidates]
+    return replace(ranking, candidates=in_order([replace(each, predicts=each.options.order <= most) for each in found]))
 
 
-def _unseen(candidate: Candidate, records: Sequence[Record]) -> float:
+def _prediction_ratio(candidate: Candidate, records: Sequence[Record]) -> float:
     """Return the mean squared error of held-back blocks over that of the fit; infinity if a fit fails."""
     options, fit = candidate.options, candidate.fit
     assert isinstance(options, DelayProfile)
     try:
-        errors = np.concatenate(held_back_errors(options, records, near_model(fit.model, options.integrators)))
+        near = fit.model.denominator[: fit.model.denominator.size - options.integrators], fit.model.delay
+        errors = np.concatenate(held_back_errors(options, records, near))
     except CtidError:
         return float("inf")
     return float(np.nanmean(errors**2)) / max(fit.cost, np.finfo(float).tiny)

@@ -11,7 +11,7 @@ from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.choose import choose
 from ctid_cli.identification.fit_warnings import with_warnings
-from ctid_cli.identification.validation import judged_on, laid_out_for
+from ctid_cli.identification.validation import laid_out_for, validated_on
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress
 from ctid_cli.signals.record import Record, as_records
 from ctid_cli.text import listed
@@ -87,9 +87,9 @@ def identify(
         return with_warnings(identification.identify(options, several, validation, *noise), time_unit)
     given = options or Given()
     choice = choose(several, given, time_unit)
-    if given.poles is None and not choice.seen:
+    if given.poles is None and not choice.has_model:
         what = "number of poles (--poles)" if given.modes is None else "submodels (--terms)"
-        raise DataError(f"{choice.why_none} Give the {what} to fit a model all the same.")
+        raise DataError(f"{choice.why_no_model} Give the {what} to fit a model all the same.")
     other = None if validation is None else with_hold(validation, choice.records[0].hold)
     if other is not None:
         # Checked before the fit, which takes longer.
@@ -97,5 +97,5 @@ def identify(
     found = identification.identify(choice.options, choice.records, None, *noise)
     found = replace(found, choices=choice.sentences)
     if other is not None:
-        found = replace(found, validation=judged_on(other, choice.options, found.fit, given))
+        found = replace(found, validation=validated_on(other, choice.options, found.fit, given))
     return with_warnings(found, time_unit)

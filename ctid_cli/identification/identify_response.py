@@ -53,21 +53,21 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain) -
     assert isinstance(fit, FrequencyDomainFit)
     assert fit.law is not None
     (residuals,), (values,) = fit.residuals, prepared.laid_out.outputs
-    answer, free = _answer(fit), free_directions(fit)[0]
+    response, free = _response_test(fit), free_directions(fit)[0]
     return Identification(
         options=options,
         fit=fit,
-        answer=answer,
-        **reported_parameters(fit, fit.law, answer.seen, prepared.laid_out)._asdict(),
+        answer=response,
+        **reported_parameters(fit, fit.law, response.seen, prepared.laid_out)._asdict(),
         tests=(),
         criteria=information_criteria(float(residuals @ residuals), fit.count, fit.theta.size - len(fit.known)),
         yic=young_information_criterion(residuals, values, fit.theta[free], fit.law.covariance[np.ix_(free, free)]),
         r_t_squared=r_t_squared(residuals, values),
-        warnings=tuple(f"{text}." for text in [*_of_delay(fit, options), *_warnings(fit, answer)][:MOST]),
+        warnings=tuple(f"{text}." for text in [*_of_delay(fit, options), *_warnings(fit, response)][:MOST]),
     )
 
 
-def _answer(fit: FrequencyDomainFit) -> ResponseTest:
+def _response_test(fit: FrequencyDomainFit) -> ResponseTest:
     """Test the model against no response by the F-distribution, allowing for a peak of the noise at any line."""
     from scipy.stats import f as f_distribution
 
@@ -94,10 +94,10 @@ def _of_delay(fit: FrequencyDomainFit, options: FrequencyDomain) -> Iterator[str
         yield f"The delay is taken as {known:g} {fit.data.units[0]}: with --delay 0:{reach:g} {fits}"
 
 
-def _warnings(fit: FrequencyDomainFit, answer: ResponseTest) -> Iterator[str]:
+def _warnings(fit: FrequencyDomainFit, response: ResponseTest) -> Iterator[str]:
     """Yield warnings, the most important first."""
-    if not answer.seen:
-        yield f"No model: the values are not seen to be anything but noise ({probability(answer.p_value)})"
+    if not response.seen:
+        yield f"No model: the values do not differ from noise ({probability(response.p_value)})"
         return
     if fit.misfit_p_value < MISFIT:
         what = f"The residuals are {np.sqrt(fit.excess):.3g} times as large as the standard errors of the data say"

@@ -1,7 +1,6 @@
 """Parts of long records that are used to choose settings."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -10,25 +9,16 @@ from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, beginning
 
-#: Samples of all records with which settings are compared, and to which the grid of structures is fitted: what can be
-#: computed in ten seconds.
-FEW, MANY = 2000, 2500
+#: Samples of all records to which models are fitted for the choice: what can be computed in ten seconds.
+PART = 2500
 #: The beginning of a record is used for the whole if input and output vary there by at least this share of all.
 LIVELY = 0.5
 
 
-class Parts(NamedTuple):
-    """Parts of records."""
-
-    records: list[Record]
-    #: Whether they start at the beginning of the records.
-    from_start: bool
-
-
-def parts_of(records: Sequence[Record], most: int) -> Parts:
-    """Return parts with at most this number of samples in total."""
-    found = [_part(record, most // len(records)) for record in records]
-    return Parts([record for record, _ in found], all(from_start for _, from_start in found))
+def parts_of(records: Sequence[Record]) -> tuple[list[Record], bool]:
+    """Return parts with at most ``PART`` samples in total, and whether all start at the beginning of their records."""
+    found = [_part(record, PART // len(records)) for record in records]
+    return [record for record, _ in found], all(from_start for _, from_start in found)
 
 
 def _part(record: Record, most: int) -> tuple[Record, bool]:

@@ -1,32 +1,25 @@
 """Changes of a fit that are tried on its own records, and selection of those that help."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from operator import is_not
-from typing import Any, Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import CtidError
-from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Options
-from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.estimators.measured_fit import MeasuredFit
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.identification.candidates import with_hold
+from ctid_cli.identification.changes import CHANGES, Change, FittedOptions, Kind, option_of
 from ctid_cli.identification.criterion import criteria_of
-from ctid_cli.identification.held_back import Near, compared, held_back_errors, long_enough, near_model
-from ctid_cli.inference.signal_features import input_moves, residual_outliers
-from ctid_cli.models.additive import Term, terms_text
-from ctid_cli.signals.held import Hold, regular_interval
+from ctid_cli.identification.held_back import compared, long_enough
+from ctid_cli.inference.signal_features import residual_outliers
 from ctid_cli.signals.record import Record, beginning
-from ctid_cli.signals.treatment import Holds, Offset
+from ctid_cli.signals.treatment import Holds
 
-#: Most samples of all records on which changes are tried.
+#: Most samples of all records of one input on which changes are tried.
 MOST_SAMPLES = 10_000
 #: Least decrease of the criterion if it alone decides, very strong evidence by Kass and Raftery (1995).
 DECISIVE = 10.0
@@ -34,18 +27,8 @@ DECISIVE = 10.0
 NO_WORSE = 1.1
 #: Most changes of one kind that are compared on held-back blocks, and most changes that are reported.
 MOST_COMPARED, MOST_NAMED = 5, 3
-#: Delays are tried up to this fraction of the shortest record, or this multiple of the greatest that was searched.
-LATEST, FARTHER = 0.1, 2.0
-#: Number of rates of an added pole, from 3 / duration to the sampling rate, and of starting delays.
-RATES, DELAYS = 4, 12
 #: Costs that differ by less than this fraction belong to the same model.
 SAME = 1e-6
-#: Damping of an added pole pair.
-DAMPING = 0.3
-
-#: Estimators of sums of submodels.
-SUMS = MeasuredSubmodels | AdditiveOutputError
-Kind = Literal["loss", "structure", "delay", "hold", "treatment"]
 
 
 @dataclass(frozen=True)
@@ -67,57 +50,14 @@ class Remedy:
     #: Fit of all samples without and with the change [%].
     fits: tuple[float, float]
     #: Whether it is combined with the remedies before it.
-    besides: bool = False
-
-    @property
-    def gain(self) -> float:
-        """Increase of the fit by the change [%]."""
-        return self.after - self.before if self.held_back else self.fits[1] - self.fits[0]
+    in_addition: bool = False
 
     def __str__(self) -> str:
-        made = f"with {self.option}{' besides' * self.besides}"
+        made = f"with {self.option}{' in addition' * self.in_addition}"
         if self.held_back:
             return f"{made} the held-back fit is {self.after:.1f} instead of {self.before:.1f} %"
         numbers = f"BIC of the innovations is {self.after:.1f} instead of {self.before:.1f}, the fit"
         return f"{made} {numbers} {self.fits[1]:.1f} instead of {self.fits[0]:.1f} %"
-
-
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """A fit of an estimator to the records with a hold of their input."""
-
-    kind: Kind
-    options: Any
-    hold: Holds
-    records: tuple[Record, ...]
-    fit: MeasuredFit
-
-    @property
-    def parameters(self) -> int:
-        """Number of free parameters, including those at infinity."""
-        return self.fit.theta.size - len(self.fit.known) + self.fit.poles_at_infinity
-
-    @property
-    def near(self) -> Near:
-        """Denominator and delay of its model."""
-        return near_model(self.fit.model, self.options.integrators)
-
-    @property
-    def starts(self) -> tuple[Near, ...]:
-        """Starts of the search for a changed estimate."""
-        return (self.near,) if isinstance(self.options, DelayProfile) else ()
-
-    @property
-    def rates(self) -> Array:
-        """Rates of poles [rad/s] that the records can resolve."""
-        longest = max(record.duration for record in self.records)
-        shortest = min(float(np.median(np.diff(record.t))) for record in self.records)
-        return np.geomspace(3.0 / longest, 1.0 / shortest, RATES)
-
-    @cached_property
-    def errors(self) -> list[Array]:
-        """Output errors of held-back blocks."""
-        return held_back_errors(self.options, self.records, self.near)
 
 
 class Trials(NamedTuple):
@@ -127,6 +67,13 @@ class Trials(NamedTuple):
     remedies: list[Remedy]
     #: Options of changes that do not.
     without_gain: list[str]
+
+
+class Helpful(NamedTuple):
+    """A remedy and its fit."""
+
+    remedy: Remedy
+    changed: FittedOptions
 
 
 def tried_remedies(
@@ -141,7 +88,7 @@ def tried_remedies(
 
     There are at most three, one of each kind: another loss if there are outliers, then the most helpful change.
     Structures, delays and holds are tried if the residuals or the search give a reason, and delays alone if no response
-    to the input is detected. For submodels the criterion decides.
+    to the input is detected. Remedies of transfer functions, of one or several inputs, are tried.
 
     A change helps if three conditions hold. It lowers Schwarz's criterion of the innovations, under one noise model
     (autoregressive, of the residuals of the closer fit) and 1.5 times the usual penalty. It improves the fit of ten
@@ -150,313 +97,134 @@ def tried_remedies(
     extrapolates. For another loss only the second counts. If blocks are too short, or the input moves in too few of
     them, the criterion decides, and must decrease by ten.
     """
-    if isinstance(options, LoopOutputError):
-        # Changes are compared by the response to the input, but here the reference drives the loop.
-        return Trials([], [])
-    submodels = isinstance(options, SUMS)
-    # A record in a loop cannot be cut.
-    most = np.inf if submodels else max(MOST_SAMPLES // len(records), 1)
-    part = tuple(record if record.n_samples <= most else beginning(record, int(most)) for record in records)
-    base = Trial("structure", options, records[0].hold, part, fit)
     found = Trials([], [])
+    # Changes are compared by the output error of the response to the input; in a loop the reference drives that, and
+    # sums of submodels take long to fit.
+    if not isinstance(options, DelayProfile) or fit.noise is not None:
+        return found
+    # Number and time of the trials both grow with the number of inputs.
+    most = max(MOST_SAMPLES // (len(records) * len(records[0].held) ** 2), 1)
+    part = tuple(beginning(record, most) for record in records)
+    base = FittedOptions(options, records[0].hold, part, fit)
     try:
-        if isinstance(options, DelayProfile) and any(map(is_not, part, records)):
-            base = replace(base, fit=options._refine(part, base.near))
-        wild = [_outliers(base.fit, k) for k in range(len(part))]
+        if any(map(is_not, part, records)):
+            base = _refitted(base, part)
+        clean = without_outliers(part, base.fit)
+        if clean is not None:
+            base = _refitted(_with_best(base, ("loss",), found)[0], clean)
         kinds: tuple[Kind, ...] = get_args(Kind)[1:] if suspicious else ("treatment",)
-        if any(off.any() for off in wild):
-            base = _best_step(base, wild, ("loss",), found)[0]
         kinds = kinds if response else ("delay",)
         while kinds and len(found.remedies) < MOST_NAMED:
-            base, kinds = _best_step(base, wild, kinds, found)
+            base, kinds = _with_best(base, kinds, found)
     except CtidError:
         return found
     return found
 
 
-def outliers_of(
-    records: Sequence[Record], options: DelayProfile | AdditiveOutputError, fit: MeasuredFit
-) -> list[BoolArray]:
-    """Return the outliers of each record if another loss helps, else none."""
-    wild = [_outliers(fit, k) for k in range(len(records))]
-    found = Trials([], [])
-    if any(off.any() for off in wild):
-        with suppress(CtidError):
-            _best_step(Trial("structure", options, records[0].hold, tuple(records), fit), wild, ("loss",), found)
-    return [(off != 0.0) & bool(found.remedies) for off in wild]
+def without_outliers(records: Sequence[Record], fit: MeasuredFit) -> tuple[Record, ...] | None:
+    """Return the records with the outliers of a fit as missing; None if there are none."""
+    law, found, total = fit.linear, [], 0
+    for record, use, e in zip(records, law.used, law.residuals, strict=True):
+        y, places = record.y.copy(), residual_outliers(e)[0]
+        y[np.flatnonzero(use)[places]] = np.nan
+        found.append(replace(record, y=y))
+        total += places.size
+    return tuple(found) if total else None
 
 
-def _best_step(
-    base: Trial, wild: Sequence[Array], kinds: Sequence[Kind], found: Trials
-) -> tuple[Trial, tuple[Kind, ...]]:
+def _refitted(base: FittedOptions, records: tuple[Record, ...]) -> FittedOptions:
+    """Return the fit to a part of the records, or without outliers."""
+    return _fitted(replace(base, records=records), Change(base.options, base.hold, [base.start()]))
+
+
+def _fitted(base: FittedOptions, change: Change) -> FittedOptions:
+    """Return the fit with a change."""
+    records = tuple(with_hold(record, change.hold) for record in base.records)
+    return FittedOptions(change.options, change.hold, records, change.options._refine(records, *change.starts))
+
+
+def _with_best(base: FittedOptions, kinds: Sequence[Kind], found: Trials) -> tuple[FittedOptions, tuple[Kind, ...]]:
     """Add the most helpful change of some kinds; return its fit, and the other kinds that help on their own."""
-    step = _Step(base, wild)
-    helpful = step.helpful(kinds)
-    if not found.remedies:
-        found.without_gain.extend(step.without_gain)
+    helpful = []
+    for kind in kinds:
+        tried = [one for change in CHANGES[kind](base) if (one := _tried(base, change)) is not None]
+        best = _best(base, kind, tried)
+        if best is not None:
+            helpful.append(best)
+        elif not found.remedies:
+            found.without_gain.extend(option_of(base, one) for one in tried)
     if not helpful:
         return base, ()
-    remedy, trial = _simplest(helpful)
-    found.remedies.append(replace(remedy, besides=bool(found.remedies)))
-    return trial, tuple(other.kind for other, _ in helpful if other is not remedy)
+    remedy, changed = _simplest(helpful)
+    found.remedies.append(replace(remedy, in_addition=bool(found.remedies)))
+    return changed, tuple(other.remedy.kind for other in helpful if other.remedy is not remedy)
 
 
-# --- changes to try ----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Change:
-    """An estimator and a hold, with starts of the search."""
-
-    options: Any
-    hold: Holds
-    starts: tuple[Near, ...]
-
-
-def _changed(base: Trial, starts: Sequence[Near] = (), **fields: object) -> Iterator[Change]:
-    """Yield a change of some options, unless the estimator refuses it."""
+def _tried(base: FittedOptions, change: Change) -> FittedOptions | None:
+    """Return the fit with a change; None if it is refused."""
     try:
-        options = replace(base.options, **fields)
-    except ValueError:
-        return
-    if options != base.options:
-        yield Change(options, base.hold, tuple(starts) or base.starts)
+        return _fitted(base, change)
+    except CtidError:
+        return None
 
 
-def _structures(base: Trial) -> Iterator[Change]:
-    """Yield one and two more poles, more zeros, and an integrator, added or replacing a pole."""
-    options = base.options
-    if options.fixed or base.fit.poles_at_infinity:
-        return
-    if isinstance(options, SUMS):
-        yield from _submodels(base)
-        return
-    (denominator, delay), n, m = base.near, options.poles, options.zeros
-    one = [(np.polymul(denominator, [1.0, rate]), delay) for rate in base.rates]
-    two = [(np.polymul(denominator, [1.0, 2.0 * DAMPING * rate, rate**2]), delay) for rate in base.rates]
-    more = (one, n + 1, m), (one, n + 1, m + 1), (two, n + 2, m + 1), (two, n + 2, m + 2), ((), n, m + 1)
-    for starts, poles, zeros in more:
-        yield from _changed(base, starts, poles=poles, zeros=zeros)
-    if not options.integrators:
-        offset = "estimate" if options.offset in ("remove", "drift") else options.offset
-        yield from _changed(base, integrators=1, offset=offset)
-        yield from _changed(base, _with_fewer(denominator, delay), poles=n - 1, integrators=1, offset=offset)
+def _best(base: FittedOptions, kind: Kind, tried: Sequence[FittedOptions]) -> Helpful | None:
+    """Return the best of the changes of one kind, if it helps."""
+    # The criterion does not apply to another loss.
+    falls = [np.inf if kind == "loss" else -float(np.diff(criteria(base, one))[0]) for one in tried]
+    least = 0.0 if long_enough(base.records) else DECISIVE
+    better = [k for k in np.argsort(falls)[::-1].tolist() if falls[k] > least]
+    helpful = [each for k in better[:MOST_COMPARED] if (each := _helpful(base, kind, tried[k])) is not None]
+    if not helpful:
+        return None
+    best = _simplest(helpful)
+    if kind in ("loss", "hold"):
+        return best
+    # The search that the estimator makes may find a lower cost, and then must help too.
+    searched = replace(best.changed.options, covariance="white").fit(best.changed.records)
+    if searched.cost >= best.changed.fit.cost * (1.0 - SAME):
+        return best
+    return _helpful(base, kind, replace(best.changed, fit=searched))
 
 
-def _submodels(base: Trial) -> Iterator[Change]:
-    """Yield one more pole of the first submodel, and one more submodel."""
-    first, *others = base.options.terms
-    yield from _changed(base, terms=(replace(first, poles=first.poles + 1), *others))
-    if base.options.factored:
-        for poles in (1, 2):
-            yield from _changed(base, terms=(first, *others, Term(poles, 0)))
+def _helpful(base: FittedOptions, kind: Kind, changed: FittedOptions) -> Helpful | None:
+    """Return a change as a remedy; None if it does not help."""
+    fits = base.fit.fit_percent, changed.fit.fit_percent
+    made = kind, option_of(base, changed), changed.options, changed.hold
+    try:
+        # Another loss must improve the fit of the samples that are no outliers.
+        clean = (kind == "loss" and without_outliers(base.records, base.fit)) or base.records
+        errors = [np.where(record.valid, e, np.nan) for record, e in zip(clean, base.errors, strict=True)]
+        gain = compared(errors, changed.errors, base.records)
+    except CtidError:
+        return None
+    if kind == "loss" or long_enough(base.records):
+        # Outliers affect the fit of all blocks; other faults must also show where a fit extrapolates.
+        helps = gain.helps and (kind == "loss" or gain.end <= 1.0)
+        remedy = Remedy(*made, gain.before, gain.after, gain.standard_error, held_back=True, fits=fits)
+        return Helpful(remedy, changed) if helps else None
+    if gain.end >= NO_WORSE:
+        return None
+    before, after = criteria(base, changed)
+    return Helpful(Remedy(*made, before, after, np.nan, held_back=False, fits=fits), changed)
 
 
-def _with_fewer(denominator: Array, delay: float) -> list[Near]:
-    """Return denominators without one real pole, or with a real pole of the same size in place of a pair."""
-    poles = np.roots(denominator)
-    found = []
-    for pole in poles[poles.imag >= 0.0].tolist():
-        left = poles[(poles != pole) & (poles != np.conj(pole))]
-        left = np.append(left, [-abs(pole)] * (pole.imag > 0.0))
-        found.append((polynomial(left), delay))
-    return found
-
-
-def _delays(base: Trial) -> Iterator[Change]:
-    """Yield a range of delays from zero to a tenth of the record."""
-    if isinstance(base.options, MeasuredSubmodels):
-        return
-    denominator, _ = base.near
-    shortest = min(record.duration for record in base.records)
-    reach = float(f"{max(FARTHER * base.options.delay_bounds[1], LATEST * shortest):.2g}")
-    if reach < 0.5 * shortest:
-        starts = [(denominator, float(delay)) for delay in np.linspace(0.0, reach, DELAYS)]
-        yield from _changed(base, starts, delay_bounds=(0.0, reach))
-
-
-def _holds(base: Trial) -> Iterator[Change]:
-    """Yield the other holds; none for steps, whose hold is visible, nor a band-limited one for an input that jumps."""
-    kinds = {input_moves(record).kind for record in base.records}
-    # A discrete controller holds its input.
-    if kinds <= {"constant", "steps"} or any(record.loop is not None for record in base.records):
-        return
-    regular = all(regular_interval(record.input.t) is not None for record in base.records)
-    for hold in get_args(Hold):
-        if hold != base.hold and (hold != "band-limited" or (regular and kinds == {"continuous"})):
-            yield Change(base.options, hold, base.starts)
-
-
-def _treatments(base: Trial) -> Iterator[Change]:
-    """Yield an initial state, an offset, both, and a drift."""
-    options, starts = base.options, base.starts
-    offsets: tuple[Offset, ...] = ("remove",)
-    if isinstance(options, DelayProfile):
-        offsets = ("estimate", "drift")
-        # The missing treatment may have moved the poles far away.
-        starts += tuple((polynomial(np.full(options.poles, -rate)), base.near[1]) for rate in base.rates)
-    state = "estimate" if options.initial_state == "rest" else options.initial_state
-    for offset in dict.fromkeys((options.offset, *offsets)):
-        for initial_state in dict.fromkeys((options.initial_state, state)):
-            fields = {"initial_state": initial_state, "offset": offset}
-            if getattr(options, "input_before", None) is not None and initial_state != "rest":
-                fields["input_before"] = None
-            yield from _changed(base, starts, **fields)
-
-
-def polynomial(roots: Array) -> Array:
-    """Return the monic polynomial with given roots, in descending powers."""
-    return np.atleast_1d(np.real(np.poly(roots)))
-
-
-def _losses(base: Trial) -> Iterator[Change]:
-    """Yield a loss that outliers do not affect."""
-    if base.options.loss == "squares":
-        yield from _changed(base, loss="tukey")
-
-
-CHANGES: dict[Kind, Callable[[Trial], Iterator[Change]]] = {
-    "loss": _losses,
-    "structure": _structures,
-    "delay": _delays,
-    "hold": _holds,
-    "treatment": _treatments,
-}
-
-
-# --- assessment --------------------------------------------------------------------------------------
-
-
-class _Step:
-    """Trials of changes of one fit."""
-
-    def __init__(self, base: Trial, wild: Sequence[Array]) -> None:
-        self.base, self.wild = base, wild
-        self.able = isinstance(base.options, DelayProfile)
-        self.blocks = self.able and long_enough(base.records)
-        self.without_gain: list[str] = []
-
-    def helpful(self, kinds: Sequence[Kind]) -> list[tuple[Remedy, Trial]]:
-        """Return the best change of each kind, if it helps."""
-        found = []
-        for kind in kinds:
-            trials = [trial for change in CHANGES[kind](self.base) if (trial := self._tried(kind, change)) is not None]
-            scored = [(self._fall(trial), trial) for trial in trials]
-            least = 0.0 if self.blocks or kind == "loss" else DECISIVE
-            better = sorted((pair for pair in scored if pair[0] > least), key=lambda pair: -pair[0])
-            judged = [(self._judged(trial), trial) for _, trial in better[:MOST_COMPARED]]
-            helpful = [(remedy, trial) for remedy, trial in judged if remedy is not None]
-            best = self._searched(*_simplest(helpful)) if helpful else None
-            if best is not None:
-                found.append(best)
-            else:
-                self.without_gain += [self._option(trial) for trial in trials]
-        return found
-
-    def _tried(self, kind: Kind, change: Change) -> Trial | None:
-        """Return the fit with a change; None if it is refused."""
-        records = tuple(with_hold(record, change.hold) for record in self.base.records)
-        try:
-            fit = change.options._refine(records, *change.starts) if self.able else change.options.fit(records)
-        except CtidError:
-            return None
-        return Trial(kind, change.options, change.hold, records, fit)
-
-    def _fall(self, trial: Trial) -> float:
-        """Return the decrease of the criterion; 1 for another loss, to which it does not apply."""
-        if trial.kind == "loss":
-            return 1.0
-        before, after = self._criteria(trial)
-        return before - after
-
-    def _criteria(self, trial: Trial) -> list[float]:
-        return criteria([self.base.fit, trial.fit], [self.base.parameters, trial.parameters], self.wild)
-
-    def _judged(self, trial: Trial) -> Remedy | None:
-        """Return a change as a remedy; None if it does not help."""
-        try:
-            if not self.able:
-                return self._by_criterion(trial)
-            before = [np.where(off == 0.0, e, np.nan) for e, off in zip(self.base.errors, self.wild, strict=True)]
-            gain = compared(before, trial.errors, self.base.records)
-        except CtidError:
-            return None
-        if self.blocks or trial.kind == "loss":
-            # Outliers affect the fit of all blocks; other faults must also show where a fit extrapolates.
-            if not gain.helps or (trial.kind != "loss" and gain.end > 1.0):
-                return None
-            return self._remedy(trial, gain.before, gain.after, gain.standard_error, held_back=True)
-        return self._by_criterion(trial) if gain.end < NO_WORSE else None
-
-    def _searched(self, remedy: Remedy, trial: Trial) -> tuple[Remedy, Trial] | None:
-        """Return a remedy with the full search of its estimator; None if it then does not help."""
-        if trial.kind in ("loss", "hold") or not self.able:
-            return remedy, trial
-        fit = replace(trial.options, covariance="white").fit(trial.records)
-        if fit.cost >= trial.fit.cost * (1.0 - SAME):
-            return remedy, trial
-        trial = replace(trial, fit=fit)
-        judged = self._judged(trial)
-        return None if judged is None else (judged, trial)
-
-    def _by_criterion(self, trial: Trial) -> Remedy:
-        before, after = self._criteria(trial)
-        return self._remedy(trial, before, after, np.nan, held_back=False)
-
-    def _remedy(self, trial: Trial, before: float, after: float, error: float, *, held_back: bool) -> Remedy:
-        made = trial.kind, self._option(trial), trial.options, trial.hold
-        fits = self.base.fit.fit_percent, trial.fit.fit_percent
-        return Remedy(*made, before, after, error, held_back, fits)
-
-    def _option(self, trial: Trial) -> str:
-        """Return the options of a change."""
-        words = [typed(self.base.options, trial.options), f"--hold {trial.hold}" * (trial.hold != self.base.hold)]
-        return " ".join(word for word in words if word)
-
-
-def _simplest(helpful: Sequence[tuple[Remedy, Trial]]) -> tuple[Remedy, Trial]:
+def _simplest(helpful: Sequence[Helpful]) -> Helpful:
     """Return the simplest of the changes within a standard error of the best."""
-    if not helpful[0][0].held_back:
-        return max(helpful, key=lambda pair: pair[0].before - pair[0].after)
-    best = max((remedy for remedy, _ in helpful), key=lambda remedy: remedy.after)
-    as_good = [pair for pair in helpful if pair[0].after >= best.after - best.standard_error]
-    return min(as_good, key=lambda pair: pair[1].parameters)
+    if not helpful[0].remedy.held_back:
+        return max(helpful, key=lambda each: each.remedy.before - each.remedy.after)
+    best = max((each.remedy for each in helpful), key=lambda remedy: remedy.after)
+    as_good = [each for each in helpful if each.remedy.after >= best.after - best.standard_error]
+    return min(as_good, key=lambda each: each.changed.parameters)
 
 
-def criteria(fits: Sequence[MeasuredFit], parameters: Sequence[int], wild: Sequence[Array]) -> list[float]:
-    """Return Schwarz's criterion of the innovations of each fit at common samples, under one noise model.
-
-    ``wild``, the distances of outliers from their neighbours, is subtracted.
-    """
-    masks = [np.logical_and.reduce(uses) for uses in zip(*(fit.used for fit in fits), strict=True)]
+def criteria(*fits: FittedOptions) -> list[float]:
+    """Return the criterion of fits at the samples that all use, under one noise model."""
+    common = [np.logical_and.reduce(uses) for uses in zip(*(one.fit.used for one in fits), strict=True)]
     models = []
-    for fit in fits:
-        common = [mask[use] for mask, use in zip(masks, fit.used, strict=True)]
-        tamed = [e - off[use] for e, off, use in zip(fit.residuals, wild, fit.used, strict=True)]
-        slopes = [(psi @ fit.tangent)[at] for psi, at in zip(fit.sensitivities, common, strict=True)]
-        models.append(([e[at] for e, at in zip(tamed, common, strict=True)], slopes))
-    return criteria_of(models, parameters)
-
-
-def _outliers(fit: MeasuredFit, k: int) -> Array:
-    """Return the distance of outliers from their neighbours [output unit], 0 at all other samples, shape (N,)."""
-    law = fit.linear
-    places, off = residual_outliers(law.residuals[k])
-    found = np.zeros(law.used[k].size)
-    found[np.flatnonzero(law.used[k])[places]] = off
-    return found
-
-
-def typed(old: Any, new: Any) -> str:
-    """Return the options of ``ctid fit`` that turn one estimator into another."""
-    words = []
-    if isinstance(new, SUMS) and old.terms != new.terms and new.factored:
-        words.append(f"--terms {terms_text(new.terms)}")
-    if old.delay_bounds != new.delay_bounds:
-        words.append("--delay {:g}:{:g}".format(*new.delay_bounds))
-    if not getattr(new, "factored", False) and (old.poles, old.zeros) != (new.poles, new.zeros):
-        words += [f"--poles {new.poles} --zeros {new.zeros}"]
-    for name in ("integrators", "initial_state", "offset", "loss"):
-        if getattr(old, name, None) != getattr(new, name, None):
-            words.append(f"--{name.replace('_', '-')} {getattr(new, name)}")
-    return " ".join(words)
+    for fit in (one.fit for one in fits):
+        places = [mask[use] for mask, use in zip(common, fit.used, strict=True)]
+        errors = [e[at] for e, at in zip(fit.residuals, places, strict=True)]
+        slopes = [(psi @ fit.tangent)[at] for psi, at in zip(fit.sensitivities, places, strict=True)]
+        models.append((errors, slopes))
+    return criteria_of(models, [one.parameters for one in fits])

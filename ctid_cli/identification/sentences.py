@@ -46,10 +46,9 @@ def of_outliers(number: int) -> str:
 
 def rest_assumed(options: Searched) -> str:
     """State that rest is assumed."""
-    level = "its first value" if options.input_before == "first" else f"{options.input_before or 0:g}"
     return (
-        f"State before the record: at rest with the input at {level}, which is assumed: the input does not change "
-        "enough after the longest delay to estimate a state besides (--initial-state, --input-before)."
+        f"State before the record: {_state(options)}; this is assumed, as the input does not change enough after the "
+        "longest delay to estimate a state."
     )
 
 
@@ -61,35 +60,23 @@ def of_state(rest: Candidate, estimated: Candidate, likely: bool) -> str:
             "(--initial-state estimate)."
         )
     best, other = sorted((rest, estimated), key=lambda each: each.criterion)
-    fall = other.criterion - best.criterion
-    return f"State before the record: {_state(best)}; the criterion is {fall:.3g} below that of {_state(other)}."
+    fall = f"the criterion is {other.criterion - best.criterion:.3g} below that of {_state(other.options)}"
+    return f"State before the record: {_state(best.options)}; {fall}."
 
 
-def _state(candidate: Candidate) -> str:
-    options = candidate.options
+def _state(options: Searched) -> str:
     if options.initial_state != "rest":
         return "estimated (--initial-state estimate)"
-    before = "at its first value" if options.input_before == "first" else f"{options.input_before or 0:g}"
-    return f"at rest, input before it {before} (--initial-state rest, --input-before {_typed(options.input_before)})"
+    before = options.input_before
+    level, typed = ("its first value", "first") if before == "first" else (f"{before or 0:g}",) * 2
+    return f"at rest with the input at {level} (--initial-state rest, --input-before {typed})"
 
 
-def _typed(before: object) -> str:
-    return "first" if before == "first" else f"{before or 0:g}"
-
-
-def of_offset(models: Ranking) -> str:
-    """Describe the treatment of the offset."""
-    other = models.runner_up("offset")
-    return (
-        f"Offset: {models.best.options.offset} (--offset); "
-        f"{_below(models, other, '' if other is None else other.options.offset)}."
-    )
-
-
-def of_hold(models: Ranking) -> str:
-    """Describe the hold."""
-    other = models.runner_up("hold")
-    return f"Hold: {models.best.hold} (--hold); {_below(models, other, '' if other is None else str(other.hold))}."
+def of_setting(models: Ranking, name: str) -> str:
+    """Describe the offset or the hold."""
+    other = models.runner_up(name)
+    fall = "nothing else could be tried" if other is None else _below(models, other, other.value(name))
+    return f"{name.capitalize()}: {models.best.value(name)} (--{name}); {fall}."
 
 
 def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
@@ -111,14 +98,16 @@ def of_range(delays: tuple[float, float], given: Given, time_unit: str) -> list[
 
 def _too_large(ranking: Ranking) -> list[str]:
     """Explain why the structure of least criterion was not chosen, if it predicts poorly."""
-    larger = [each for each in ranking.candidates if not each.stands and each.unseen == each.unseen]
+    larger = [
+        each for each in ranking.candidates if not each.predicts and each.prediction_ratio == each.prediction_ratio
+    ]
     if not larger:
         return []
     each, best = min(larger, key=lambda each: each.criterion), ranking.best
     named = f"{each.name} (criterion {best.criterion - each.criterion:.3g} lower)"
     return [
-        f"Not larger: in blocks that it did not see the squared error of {named} is {each.unseen:.2g} times that "
-        f"of its fit; that of {best.name} is {best.unseen:.2g} times."
+        f"Not larger: in held-back blocks the squared error of {named} is {each.prediction_ratio:.2g} times that "
+        f"of its fit; that of {best.name} is {best.prediction_ratio:.2g} times."
     ]
 
 
@@ -129,7 +118,5 @@ def of_criterion(ranking: Ranking) -> str:
     return f"Criterion: BIC of the innovations with {noise} for all, each parameter counted {PENALTY:g} times."
 
 
-def _below(models: Ranking, other: Candidate | None, name: str) -> str:
-    if other is None:
-        return "nothing else could be tried"
+def _below(models: Ranking, other: Candidate, name: object) -> str:
     return f"the criterion is {other.criterion - models.best.criterion:.3g} below that of {name}, the runner-up"

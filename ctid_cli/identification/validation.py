@@ -26,7 +26,7 @@ def laid_out_for(record: Record, options: Searched, given: Given) -> list[tuple[
     return [(each, laid_out) for each, laid_out in pairs if isinstance(laid_out, MeasuredRecords)]
 
 
-def judged_on(record: Record, options: Searched, fit: MeasuredFit, given: Given) -> Validation:
+def validated_on(record: Record, options: Searched, fit: MeasuredFit, given: Given) -> Validation:
     """Assess a fixed model on a record, in the treatment that the criterion prefers."""
     tried = laid_out_for(record, options, given)
     applied = [own._applied(fit, laid_out) for own, laid_out in tried]

@@ -185,9 +185,9 @@ class _Spectra:
         coherence = np.minimum(yu / np.maximum(uu * yy, np.finfo(float).tiny), 1.0)
         p_value = (1.0 - coherence) ** (independent - 1.0)
         likely = np.concatenate(([False], p_value < PAIR_LEVEL, [False]))
-        seen = (p_value < SINGLE_LEVEL) | (likely[1:-1] & (likely[:-2] | likely[2:]))
+        detected = (p_value < SINGLE_LEVEL) | (likely[1:-1] & (likely[:-2] | likely[2:]))
         unbiased = np.clip((coherence - 1 / independent) / (1 - 1 / independent), 0.0, 1.0)
-        response_power = np.where(seen, unbiased * yy, 0.0)
+        response_power = np.where(detected, unbiased * yy, 0.0)
         return cls(edges * 2 * math.pi / (n * grid.interval), uu, yy, response_power)
 
     @property

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
+from ctid_cli.identification.candidate_diagnostics import CandidateDiagnostics, diagnosed
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Candidate, Searched
-from ctid_cli.identification.judged import JudgedCandidate, judged_candidates
 from ctid_cli.identification.sentences import spelled
 from ctid_cli.reporting.document import Column, Result, Section
 from ctid_cli.reporting.figures.style import LOOKS, MARK, Drawing, name_axes, plain
@@ -45,23 +45,23 @@ class OrderSearchResult(Result):
     schema = "ctid-order-1"
 
     choice: Choice
-    judged: Sequence[JudgedCandidate]
+    candidates: Sequence[CandidateDiagnostics]
     records: Records
 
     @classmethod
     def of(cls, choice: Choice, given: Given, records: Records) -> OrderSearchResult:
         """Return the structures of a choice with their diagnostics."""
-        return cls(choice, judged_candidates(choice, given, records.validation_record), records)
+        return cls(choice, diagnosed(choice, given, records.validation_record), records)
 
     def sections(self) -> list[Section]:
         """Return the choice, the best structures, and the other choices."""
         choice = self.choice
-        verdict = f"Chosen: {spelled(choice.ranking.best.options)}." if choice.seen else choice.why_none
+        verdict = f"Chosen: {spelled(choice.ranking.best.options)}." if choice.has_model else choice.why_no_model
         notes = [f"- {note}" for note in (*choice.sentences, *self.records.notes)]
-        if any(not each.candidate.is_admissible for each in self.judged[:ROWS]):
+        if any(not each.candidate.is_admissible for each in self.candidates[:ROWS]):
             notes.append(ABOUT_NO_CANDIDATE)
-        if len(self.judged) > ROWS:
-            notes.append(f"- The best {ROWS} of {len(self.judged)} structures; all are in order.json.")
+        if len(self.candidates) > ROWS:
+            notes.append(f"- The best {ROWS} of {len(self.candidates)} structures; all are in order.json.")
         return [
             Section("", [self.records.line, verdict]),
             self._table(ROWS, drawing=self.drawing()),
@@ -90,7 +90,7 @@ class OrderSearchResult(Result):
             label += ", integrator" * bool(integrators)
             error.plot(poles, np.sqrt([each.fit.cost for each in own]), label=label, **look)
             criterion.plot(poles, [each.criterion - best.criterion for each in own], label=label, **look)
-        if self.choice.seen:
+        if self.choice.has_model:
             chosen = {"color": MARK, "markersize": 13, "fillstyle": "none", "label": "chosen"}
             criterion.plot(best.options.order, 0.0, "o", **chosen)
         error.set_yscale("log")
@@ -121,9 +121,9 @@ class OrderSearchResult(Result):
             Column("validation_percent", "validation %", ".2f"),
             Column("delay", form=".4g", unit=self.records.units.time),
         )
-        rows = [self._content(each) for each in self.judged[:most]]
-        marks = [NO_CANDIDATE * (not each.candidate.is_admissible) for each in self.judged[:most]]
-        if marks and self.choice.seen:
+        rows = [self._content(each) for each in self.candidates[:most]]
+        marks = [NO_CANDIDATE * (not each.candidate.is_admissible) for each in self.candidates[:most]]
+        if marks and self.choice.has_model:
             marks[0] = "*"
         marked = [row | {"chosen": mark} for row, mark in zip(rows, marks, strict=True)]
         return Section.table(marked, columns, **parts)
@@ -133,16 +133,16 @@ class OrderSearchResult(Result):
         choice, best = self.choice, self.choice.ranking.best
         return {
             **self.records.content(),
-            "recommended": _structure(best.options) if choice.seen else None,
-            "reason": " ".join(choice.sentences) if choice.seen else choice.why_none,
+            "recommended": _structure(best.options) if choice.has_model else None,
+            "reason": " ".join(choice.sentences) if choice.has_model else choice.why_no_model,
             "choices": choice.sentences,
             "command": choice.words(),
             "noise_order": choice.ranking.noise.order,
             "answer_p_value": choice.answer.p_value,
-            "orders": [self._content(each) for each in self.judged],
+            "orders": [self._content(each) for each in self.candidates],
         }
 
-    def _content(self, each: JudgedCandidate) -> dict[str, Any]:
+    def _content(self, each: CandidateDiagnostics) -> dict[str, Any]:
         fit, criteria, least = each.candidate.fit, each.candidate.criteria, self.choice.ranking.best
         tested = bool(each.tests)
         return {

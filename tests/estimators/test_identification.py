@@ -91,7 +91,7 @@ def test_a_delay_at_its_bound_has_no_standard_error():
     assert np.isnan(delay.standard_error)
     assert delay.high == 0.4
     assert np.isfinite(by_name(result)["a1"].standard_error)
-    assert "The delay lies at the end of its range, 0.4 s: with --delay 0:" in result.warnings[0]
+    assert "The delay is at the end of its range, 0.4 s: with --delay 0:" in result.warnings[0]
 
 
 def test_a_small_zero_and_a_delay_are_undetermined():
@@ -146,7 +146,7 @@ def test_a_model_that_fails_validation_is_reported():
     x = simulate(result.fit.model, other.input, other.t)
     assert result.validation.r2 == pytest.approx(1 - np.mean((other.y - x) ** 2) / np.var(other.y))
     assert result.validation.r2 < 0
-    assert any("does not carry over" in warning for warning in result.warnings)
+    assert any("does not generalise" in warning for warning in result.warnings)
 
 
 def test_without_a_response_the_first_warning_says_so():
@@ -154,7 +154,7 @@ def test_without_a_response_the_first_warning_says_so():
     noise = Record(record.t, np.random.default_rng(3).standard_normal(300), record.input)
     result = identify([noise], DelayProfile(1, 0, (0, 3), offset="estimate"))
     assert not result.answer.seen
-    assert result.warnings[0].startswith("No model: the output is not seen to respond to the input (p = ")
+    assert result.warnings[0].startswith("No model: no response of the output to the input is detected (p = ")
     for name in ("b0", "a1", "delay"):
         item = by_name(result)[name]
         assert (item.status, np.isnan(item.standard_error)) == ("undetermined", True)

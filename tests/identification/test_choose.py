@@ -120,12 +120,12 @@ def test_the_grid_goes_on_while_more_poles_pay_against_white_noise():
     assert still_pays(ranked([*ranking.candidates, larger]), 4)
 
 
-@pytest.mark.parametrize(("unseen", "chosen"), [(1.5, 4), (2.5, 2)])
-def test_a_structure_that_predicts_far_worse_than_a_smaller_one_is_no_candidate(monkeypatch, unseen, chosen):
+@pytest.mark.parametrize(("ratio", "chosen"), [(1.5, 4), (2.5, 2)])
+def test_a_structure_that_predicts_far_worse_than_a_smaller_one_is_no_candidate(monkeypatch, ratio, chosen):
     # Blocks are predicted with this ratio of their squared error to that of the fit.
     record = record_of(SECOND)
     best = choose(record).ranking.best
-    sizes = {4: unseen, 3: 1.2, 2: 1.0}
+    sizes = {4: ratio, 3: 1.2, 2: 1.0}
     grid = [
         replace(best, options=replace(best.options, poles=poles), criterion=best.criterion + 10.0 * (k - 1))
         for k, poles in enumerate((4, 2, 3))
@@ -135,7 +135,7 @@ def test_a_structure_that_predicts_far_worse_than_a_smaller_one_is_no_candidate(
         return [np.full(record.n_samples, np.sqrt(sizes[options.poles] * best.fit.cost)) for record in records]
 
     monkeypatch.setattr(held_back, "held_back_errors", errors)
-    ranking = held_back.standing(Ranking(tuple(grid), ranked([best]).noise), [record])
+    ranking = held_back.without_overfitted(Ranking(tuple(grid), ranked([best]).noise), [record])
     assert ranking.best.options.poles == chosen
     assert len(ranking.candidates) == 3
     said = " ".join(of_grid(ranking, (0.0, 1.0), Given(), "s"))
@@ -194,20 +194,20 @@ def test_a_validation_record_has_a_state_and_an_offset_of_its_own():
     assert found.validation.fit_percent > 85
 
 
-def test_a_validation_record_is_judged_and_enters_nothing_else():
+def test_a_validation_record_does_not_change_the_model():
     other = record_of(TransferFunction([-2.0], [1.0, 1.2, 4.0], 0.23), seed=1)
-    alone, judged = (identify(record_of(SECOND), validation=each) for each in (None, other))
-    first, *others = judged.warnings
-    assert "it does not carry over" in first
-    assert (judged.choices, judged.options, others) == (alone.choices, alone.options, list(alone.warnings))
-    np.testing.assert_array_equal(judged.fit.theta, alone.fit.theta)
+    alone, validated = (identify(record_of(SECOND), validation=each) for each in (None, other))
+    first, *others = validated.warnings
+    assert "does not generalise" in first
+    assert (validated.choices, validated.options, others) == (alone.choices, alone.options, list(alone.warnings))
+    np.testing.assert_array_equal(validated.fit.theta, alone.fit.theta)
 
 
 def test_no_response_is_no_model():
     noise = record_of(SECOND)
     noise = Record(noise.t, np.random.default_rng(5).standard_normal(600), noise.input)
     assert not choose(noise).seen
-    with pytest.raises(DataError, match="no model here"):
+    with pytest.raises(DataError, match="No model"):
         identify(noise)
 
 

@@ -5,15 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
+from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.identification.fit_warnings import MOST, fit_warnings
 from ctid_cli.identification.held_back import block_numbers, compared, held_back_errors
 from ctid_cli.identification.identify import identify
 from ctid_cli.identification.remedies import tried_remedies
 from ctid_cli.inference.fit import Status
-from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
@@ -50,6 +48,15 @@ def step_of(lead, model=SYSTEM):
     return Record(t, simulate(model, signal, t) + NOISE * rng.standard_normal(t.size), signal)
 
 
+def two_inputs(delay=0.0, seed=0, n=600):
+    """Return the sum of the responses of two systems of second order to two inputs."""
+    rng, t = np.random.default_rng(seed), 0.2 * np.arange(n)
+    u1, u2 = (np.repeat(rng.choice([-1.0, 1.0], n), rng.integers(3, 12, n))[:n] for _ in range(2))
+    pairs = zip((SYSTEM, replace(SYSTEM, delay=delay)), (u1, u2), strict=True)
+    x = sum(simulate(model, HeldSignal(t, u), t) for model, u in pairs)
+    return Record(t, x + NOISE * rng.standard_normal(n), {"u1": u1, "u2": u2})
+
+
 def looped(gain=0.8, n=1000):
     """Return a record in the loop of a proportional controller."""
     rng = np.random.default_rng(5)
@@ -67,7 +74,7 @@ CLEAN = record_of()
 FEW = 40 + 61 * np.arange(15)
 FREE = 3.0 * np.exp(-0.4 * CLEAN.t) * np.cos(1.36 * CLEAN.t)
 DRIFTING = changed(CLEAN, CLEAN.y + 5.0 + 10 * NOISE * np.linspace(0, 1, 1000))
-MENDED = {
+REMEDIED = {
     "one pole too few": (CLEAN, FIRST_ORDER, "with --poles 2 --zeros 0 the held-back fit is"),
     "two poles too few": (
         record_of(TransferFunction([8.0, 4.0, 20.0], np.polymul([1.0, 0.4, 2.0], [1.0, 0.8, 12.0]))),
@@ -79,33 +86,39 @@ MENDED = {
     "a delay outside the range": (
         record_of(LATE),
         SEARCHED,
-        "The delay lies at the end of its range, 1 s: with --delay ",
+        "The delay is at the end of its range, 1 s: with --delay ",
     ),
     "the wrong hold": (record_of(hold="foh", read_as="zoh", interval=0.8), KNOWN, "with --hold foh the held-back"),
     "outliers": (spoilt(CLEAN, FEW, 50 * NOISE), KNOWN, "15 output samples are outliers (t = 8, 20.2, 32.4 s, ...)"),
     "an offset": (changed(CLEAN, CLEAN.y + 0.3), KNOWN, "with --offset estimate the held-back fit is"),
     "a drift": (DRIFTING, KNOWN, "with --offset drift the held-back fit is"),
     "a step of one pole too few": (step_of(20.0), FIRST_ORDER, "with --poles 2 --zeros 0 BIC of the innovations is"),
-    "a submodel too few": (CLEAN, MeasuredSubmodels((Term(1, 0),)), "with --terms 2/0 BIC of the innovations is"),
+    "one pole too few, two inputs": (two_inputs(), FIRST_ORDER, "with --poles 2 --zeros 0 the held-back fit is"),
+    "a delay of the second input": (two_inputs(2.5), SEARCHED, "with --delay u2=0:12 the held-back fit is"),
+    "one pole too few for the first input": (
+        two_inputs(),
+        replace(FIRST_ORDER, inputs=(InputModel("u1", poles=1), InputModel("u2", poles=2))),
+        "with --poles u1=2 --zeros u1=0 the held-back fit is",
+    ),
 }
-SEEN = {
+OBSERVED = {
     "an unstable plant": (record_of(TransferFunction([1.0], [1.0, -0.04])), FIRST_ORDER, "The output diverges"),
     "feedback": (looped(), FIRST_ORDER, "The input follows earlier residuals"),
     "saturation": (changed(CLEAN, np.clip(CLEAN.y, -0.9, 0.9)), KNOWN, "exactly at the least or greatest value"),
 }
 
 
-@pytest.mark.parametrize("fault", MENDED)
+@pytest.mark.parametrize("fault", REMEDIED)
 def test_a_planted_fault_is_named_first_with_a_remedy_that_was_tried(fault):
-    record, options, words = MENDED[fault]
+    record, options, words = REMEDIED[fault]
     warnings = identify([record], options).warnings
     assert words in warnings[0]
     assert len(warnings) <= MOST
 
 
-@pytest.mark.parametrize("fault", SEEN)
+@pytest.mark.parametrize("fault", OBSERVED)
 def test_what_has_no_remedy_is_said_without_one(fault):
-    record, options, words = SEEN[fault]
+    record, options, words = OBSERVED[fault]
     (found,) = (warning for warning in identify([record], options).warnings if words in warning)
     assert "--" not in found
 
@@ -131,10 +144,10 @@ def test_a_low_fit_says_what_was_tried_without_gain():
     assert "tried without gain: other values of --poles, --zeros, " in low
 
 
-def test_another_remedy_is_named_besides_the_first():
+def test_another_remedy_is_named_in_addition_to_the_first():
     record = changed(CLEAN, CLEAN.y + 0.6)
     found = tried_remedies([record], FIRST_ORDER, FIRST_ORDER.fit([record])).remedies
-    assert [remedy.besides for remedy in found] == [False, True]
+    assert [remedy.in_addition for remedy in found] == [False, True]
     assert [remedy.kind for remedy in found] == ["structure", "treatment"]
     assert found[1].before == pytest.approx(found[0].after, abs=0.01)
     assert found[1].options == replace(found[0].options, offset="estimate")
@@ -179,5 +192,5 @@ def test_feedback_that_is_known_is_no_warning():
 def test_of_a_search_that_did_not_end_nothing_else_is_said():
     found = identify(record_of(), FIRST_ORDER)
     unfinished = replace(found, fit=replace(found.fit, status=Status.MAX_ITERATIONS))
-    (said,) = fit_warnings(unfinished)
-    assert str(said).startswith("The iterations stopped at max_iterations")
+    (text,) = fit_warnings(unfinished)
+    assert text.startswith("The iterations stopped at max_iterations")

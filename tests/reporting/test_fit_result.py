@@ -146,7 +146,7 @@ def test_a_pole_that_ran_to_infinity_is_missing_in_words():
     fitted = identify(Record(one.t, early, one.input), given)
     result = FitResult.of(fitted)
     assert fitted.fit.model.order == 1
-    assert any("1 pole fewer than asked for" in warning for warning in fitted.warnings)
+    assert any("1 pole fewer than specified" in warning for warning in fitted.warnings)
     assert dict(result.settings())["model"].startswith("2 poles, no zero (1 of the poles at infinity, not shown)")
     assert "not shown" in result.page_head()[1]
 
