@@ -107,13 +107,20 @@ def _error_at(x: Array, error: Array, covariance: Array, slope_error: Array) -> 
 
 
 def _leaked(tones: WindowTones, length: int) -> Array:
-    """Return the energy of the residual line at each tone, in units of the noise, shape (R, n).
+    """Return the energy of the residual lines and changes at each tone, in units of the noise, shape (R, n).
 
     It is infinite for a line within the width of the tone.
     """
-    away = np.abs(tones.omega - tones.line[:, None]) * length / (2.0 * np.pi)
+    bins = length / (2.0 * np.pi)
+    away = np.abs(tones.omega - tones.line[:, None]) * bins
     line = np.where(tones.line_chance < c.LEVEL, tones.line_energy, 0.0)[:, None]
-    return np.asarray(np.where((line > 0.0) & (away < c.APART), np.inf, line / np.maximum(away, c.APART) ** 2))
+    leaked = np.where((line > 0.0) & (away < c.APART), np.inf, line / np.maximum(away, c.APART) ** 2)
+    changed = np.where(tones.change_chance < c.LEVEL, tones.change_energy, 0.0)
+    for j in np.flatnonzero(changed.any(axis=0)):
+        away = np.maximum(np.abs(tones.omega - tones.omega[:, j, None]) * bins, c.SMALLEST_FLOOR)
+        away[:, j] = np.inf
+        leaked = np.fmax(leaked, changed[:, j, None] / away**2)
+    return np.asarray(leaked)
 
 
 def _raised(tones: WindowTones, length: int) -> Array:
@@ -121,13 +128,21 @@ def _raised(tones: WindowTones, length: int) -> Array:
     own = c.STEP**2 * np.where(tones.change_chance < c.DOUBTFUL, tones.change_energy, 0.0)
     changed = tones.change_chance < c.LEVEL
     own[changed] = c.KINKED**2 * tones.change_energy[changed]
+    own[changed & (tones.change_energy > c.SMALL_CHANGE * _energy(tones))] = np.inf
     return np.asarray(np.sqrt(1.0 + (own + c.LEAKAGE**2 * _leaked(tones, length)) / c.COVERED**2))
+
+
+def _energy(tones: WindowTones) -> Array:
+    """Return the energy of tones in units of the noise, shape (R, n)."""
+    return 0.5 * (tones.amplitude / tones.amplitude_error) ** 2
 
 
 def _sound(tones: WindowTones, length: int) -> BoolArray:
     """Return which tones are not disturbed by the residual of their window, shape (R, n)."""
-    sound = np.isfinite(tones.omega_error) & tones.converged[:, None]
-    return np.asarray(sound & (_raised(tones, length) < c.MOST_RAISED))
+    sound = np.isfinite(tones.omega_error) & tones.converged[:, None] & (_raised(tones, length) < c.MOST_RAISED)
+    full = np.isfinite(tones.omega).all(axis=1, keepdims=True)
+    line = np.where(tones.line_chance < c.LEVEL, tones.line_energy, 0.0)[:, None]
+    return np.asarray(sound & ~(full & (line > c.COMPARABLE * _energy(tones))))
 
 
 def explained(tones: WindowTones, length: int) -> bool:
@@ -157,20 +172,25 @@ def _combs(tones: WindowTones) -> tuple[Array, Array, Array]:
     if tones.omega.shape[1] < c.COMB:
         return gap, low, high
     order = np.argsort(tones.omega, axis=1)
-    omega = np.take_along_axis(tones.omega, order, axis=1)
-    steps = np.diff(omega, axis=1)
-    equal = np.abs(np.diff(steps, axis=1)) <= c.UNEQUAL * steps[:, :-1]
-    equal &= steps[:, :-1] < c.HARMONIC * omega[:, :-2]
+    omega, error = (np.take_along_axis(each, order, axis=1) for each in (tones.omega, tones.omega_error))
+    steps, sure = np.diff(omega, axis=1), np.hypot(error[:, 1:], error[:, :-1])
+    allowed = np.maximum(c.EQUAL_ERRORS * np.maximum(sure[:, 1:], sure[:, :-1]), c.UNEQUAL * steps[:, :-1])
+    equal = (np.abs(np.diff(steps, axis=1)) <= allowed) & (steps[:, :-1] < c.HARMONIC * omega[:, :-2])
     for row, k in np.argwhere(equal):
-        middle, base = omega[row, k + 1], steps[row, k]
         if gap[row, order[row, k + 1]] > 0.0:
             continue
-        # All lines at multiples of the spacing belong to the comb.
-        away = (omega[row] - middle) / base
-        lines = np.round(away[np.abs(away - np.round(away)) <= c.UNEQUAL * np.maximum(1.0, np.abs(away))])
-        bottom, top = middle + base * (lines.min() - c.COMB_MARGIN), middle + base * (lines.max() + c.COMB_MARGIN)
-        inside = order[row, (bottom < omega[row]) & (omega[row] < top)]
-        gap[row, inside], low[row, inside], high[row, inside] = base, bottom, top
+        # All lines at multiples of the spacing belong to the comb, unless too many are missing between them.
+        base = steps[row, k]
+        away = (omega[row] - omega[row, k + 1]) / base
+        lines = np.sort(np.round(away[np.abs(away - np.round(away)) <= c.UNEQUAL * np.maximum(1.0, np.abs(away))]))
+        breaks = np.flatnonzero(np.diff(lines) > c.MOST_APART)
+        begin = np.searchsorted(breaks, np.searchsorted(lines, 0.0))
+        first = lines[breaks[begin - 1] + 1] if begin > 0 else lines[0]
+        last = lines[breaks[begin]] if begin < breaks.size else lines[-1]
+        inside = order[row, (away > first - c.BESIDE) & (away < last + c.BESIDE)]
+        gap[row, inside] = base
+        low[row, inside] = omega[row, k + 1] + (first - c.BESIDE) * base
+        high[row, inside] = omega[row, k + 1] + (last + c.BESIDE) * base
     return gap, low, high
 
 

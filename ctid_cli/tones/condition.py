@@ -40,8 +40,8 @@ def condition(samples: Array, interval: float) -> Conditioned:
     reasons = []
     if spikes.any():
         samples = np.where(spikes, np.nan, samples)
-        treated = f"Spikes, {c.SPIKE_TIMES:g} times as high as all around them, are taken as missing"
-        reasons.append(f"{treated}: {spikes.sum()}.")
+        told = f"Spikes, {c.SPIKE_TIMES:g} times as high as all around them, are taken as missing"
+        reasons.append(f"{told}: {spikes.sum()}.")
     scale = float(np.nanmax(np.abs(samples)))
     # Dither: a rounded signal has no noise from which errors could be estimated.
     samples = samples / scale + c.DITHER * np.random.default_rng(0).standard_normal(samples.size)
@@ -96,18 +96,22 @@ def refuse_unusable(samples: Array) -> None:
 
 def find_spikes(samples: Array) -> BoolArray:
     """Return the mask of spikes: values that no sum of a few tones can have; samples may be missing."""
-    from scipy.ndimage import maximum_filter1d  # slow to import
-
     there = np.isfinite(samples)
     if not there.any():
         return there
     size = np.where(there, np.abs(samples - np.median(samples[there])), 0.0)
+    # Block maxima; on each side of a spike, the next block or the one after it lies within the range compared.
     half, reach = c.SPIKE_AROUND // 2, c.SPIKE_WIDTH + c.SPIKE_AROUND
-    largest = maximum_filter1d(np.pad(size, reach), c.SPIKE_AROUND, mode="constant")
-    before = largest[c.SPIKE_AROUND - half :][: size.size]
-    after = largest[reach + c.SPIKE_WIDTH + 1 + half :][: size.size]
-    around = np.maximum(before, after)
-    spikes = (around > 0.0) & (size > c.SPIKE_TIMES * around)
+    blocks = np.pad(size, (0, -size.size % half)).reshape(-1, half).max(axis=1)
+    around = np.pad(blocks, 2)
+    before, after = np.minimum(around[:-4], around[1:-3]), np.minimum(around[3:-1], around[4:])
+    least = c.SPIKE_TIMES * np.repeat(np.maximum(before, after), half)[: size.size]
+    spikes = np.zeros(size.size, np.bool_)
+    padded = np.pad(size, reach)
+    for place in np.flatnonzero(size > least):
+        left = padded[place : place + c.SPIKE_AROUND].max()
+        right = padded[place + reach + c.SPIKE_WIDTH + 1 :][: c.SPIKE_AROUND].max()
+        spikes[place] = 0.0 < c.SPIKE_TIMES * max(left, right) < size[place]
     return spikes if spikes.mean() <= c.MOST_SPIKES else np.zeros_like(spikes)
 
 

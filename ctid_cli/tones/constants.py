@@ -2,16 +2,8 @@
 
 "Measured" marks values that were set on signals of ``benchmarks/track_honesty.py``, with an earlier form of this
 tracker. What has neither that mark nor a source is a choice; the benchmark tests all of them together. Constants of the
-compiled kernels are in :mod:`ctid_cli.tones.tone_kernels`.
-
-On 60 of these signals (seed 20261128, number of tones from the record) 8 of 5,640 valid rows are wrong, and 4,973 of
-5,474 possible rows are valid. With one rule less, these numbers are: curvature (QUIET, BENT) 10 and 4,995; growth
-(GROWS) 11 and 4,975; kinks (MOVES) 13 and 5,006; possible changes (DOUBTFUL) 19 and 5,009; whitening of first order 17
-and 4,932; single lines (FURTHER 0) 8 and 4,953. Combs and shorter windows that are clearer have no effect there, but
-tests of vibrato and of crossing tones need them.
+compiled fit are in :mod:`ctid_cli.tones.tone_kernels`.
 """
-
-import numpy as np
 
 # --- request --------------------------------------------------------------------------------------------------------
 
@@ -70,22 +62,24 @@ PADDING = 2
 #: variables: the median has the variance 1/n, over ln(2)^2.
 FLOOR_BINS = 101
 MEDIAN_EFFICIENCY = 0.48
-#: Whitening model: highest order, samples per coefficient, and ratio to the noise floor at which ordinates are clipped
-#: before (noise exceeds it in 1 of 150).
+#: Whitening model: highest order, samples per coefficient, rounds, and ratio to the noise floor at which ordinates are
+#: clipped before (noise exceeds it in 1 of 150).
 WHITENING_ORDER = 4
 SAMPLES_PER_ORDER = 128
+WHITENING_ROUNDS = 2
 CUT = 5.0
 #: Smallest divisors.
 SMALLEST_FLOOR = 1e-300
+SMALLEST_GAIN = 1e-12
 LEAST_NOISE = 1e-6
+#: Ratio of a tapered spectrum to its noise floor that shows a line in noise of any colour. Measured.
+LINE_HEIGHT = 2e4
 #: Independent ordinates of a padded periodogram per sample, measured on white noise.
 INDEPENDENT = 0.8
 #: Significance level per window of the tests for lines and changes.
 LEVEL = 5e-4
 #: Factor of the p-value of the test for changes, 3.6 c exp(-c/2), measured on windows of 64 to 1000 samples.
 CHANGE_TAIL = 3.6
-#: Share of the window at each end in which no change is searched for.
-ENDS = 0.05
 #: Lines added together with the strongest one, to save time only: their number, bins between them, and the share of
 #: its energy that they exceed.
 FURTHER = 4
@@ -103,24 +97,8 @@ HOPS = 2
 SAMPLES_PER_PARAMETER = 3
 #: A line closer to a tone than this number of bins is a change of it, or a tone that the window does not resolve.
 APART = 1.5
-#: Number of free parameters of each tone and most steps of each stage: amplitudes first, curvature last.
-STAGES = ((2, 1), (4, 4), (5, 60))
-#: Largest values of the parameters: growth of the logarithm of the amplitude, and quadratic phase, over half a window.
-BOUNDS = (np.inf, np.inf, 4.0, np.inf, 1e4)
-#: A stage ends when a step would lower the sum of squares by less than this share of one sample's, or changes no
-#: phase by more than this [rad] and no amplitude by more than this share.
-SMALL_GAIN = 1e-3
-SMALL_STEP = 1e-9
-#: Longest step of a phase over half a window [rad]; longer ones may end in another local minimum.
-LONGEST_STEP = 2.0
-#: Marquardt's damping in units of the diagonal: first value, factors, and largest value.
-DAMPING = 1e-4
-RAISED = 10.0
-LOWERED = 0.1
-LEAST_DAMPING = 1e-12
-MOST_DAMPING = 1e6
-#: Added to the diagonal before a covariance is computed, as a share of it.
-RIDGE = 1e-13
+#: Least amplitude, in standard errors, of a tone in shorter windows that starts the fit of a longer one.
+SURE = 6.0
 #: Largest number of steps of a stage of a fit. A record of few steady tones is fitted as a whole, in few rounds of few
 #: steps: this takes a tenth of the time of windows of all lengths. Its residual is tested for lines in windows that are
 #: shorter by STEADY_STEP each.
@@ -130,7 +108,7 @@ STEADY_ROUNDS = 2
 STEADY_STEPS = 8
 STEADY_STEP = 4
 #: Samples of the windows that are computed together, which fit in the cache. No result depends on it.
-BLOCK_SAMPLES = 2**16
+BLOCK_SAMPLES = 2**17
 
 # --- residuals ------------------------------------------------------------------------------------------------------
 
@@ -139,6 +117,8 @@ BLOCK_SAMPLES = 2**16
 LEAKAGE = 0.78
 #: Largest ratio of the error of a reading to that of its fit; readings beyond it are not used.
 MOST_RAISED = 20.0
+#: A full window gives no reading of a tone if its residual has a line of more than this share of the tone's energy.
+COMPARABLE = 0.1
 #: Lines of one window closer than this number of bins may be one tone that changes. Measured.
 RESOLVED = 1.7
 #: Fewest periods of a tone in a window, and its least amplitude in standard errors.
@@ -155,21 +135,26 @@ KINK = 0.27
 HIDDEN_KINK = 18.0
 #: A change of energy E shifts the frequency by at most these multiples of sqrt(E) standard errors: the largest ratios
 #: for a step of phase anywhere in the window, and for one of frequency in its middle, computed without noise. A change
-#: with a p-value below DOUBTFUL is possible, and at most a step of phase.
+#: with a p-value below DOUBTFUL is possible, and at most a step of phase. One above the share SMALL_CHANGE of the
+#: tone's energy may be of any kind.
 STEP = 2.8
 KINKED = 18.1
 DOUBTFUL = 0.1
+SMALL_CHANGE = 0.005
 #: Two unresolved tones may look like one whose growth exceeds GROWS errors but not BLENDED_GROWTH over half a window;
 #: they bias its frequency by at most its growth [rad/sample].
 GROWS = 2.0
 BLENDED_GROWTH = 1.0
 #: Standard errors that must cover a bias: biases are divided by this number.
 COVERED = 3.0
-#: COMB or more lines with spacings equal within the share UNEQUAL may be one modulated tone. Lines within COMB_MARGIN
-#: spacings of its ends belong to it. Spacings above the share HARMONIC of the frequency are those of harmonics.
+#: COMB or more lines with spacings equal within the share UNEQUAL, or EQUAL_ERRORS, may be one modulated tone. Adjacent
+#: lines of the comb are at most MOST_APART spacings apart; lines within BESIDE spacings of its ends belong to it.
+#: Spacings above the share HARMONIC of the frequency are those of harmonics.
 COMB = 3
 UNEQUAL = 0.05
-COMB_MARGIN = 3.0
+EQUAL_ERRORS = 5.0
+MOST_APART = 4
+BESIDE = 3.0
 HARMONIC = 0.2
 #: A line of a comb that shorter windows reject at more than this share of the rows is rejected at all rows.
 REFUTED = 0.25
@@ -184,8 +169,12 @@ GATE_ERRORS = 5.0
 GATE_BINS = 1.0
 #: A tone ends after more rows without readings than this, and than one of its windows.
 PATIENCE = 3
-#: A tone that ends and one that begins later are one tone if their relative frequency difference is smaller.
+#: A tone that ends and one that begins later are one tone if their relative frequency difference is below LARGEST_JUMP;
+#: a pause as long as the record adds PAUSE.
 LARGEST_JUMP = 0.25
+PAUSE = 0.25
+#: Relative standard error of the frequency that a tone must reach at some row.
+COARSE = 0.01
 
 # --- residual of a track --------------------------------------------------------------------------------------------
 

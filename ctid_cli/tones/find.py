@@ -1,4 +1,4 @@
-"""Detection of lines and changes in the residuals of windows."""
+"""Detection of lines in the residuals of windows: noise spectrum, noise floor and strongest ordinates."""
 
 from typing import NamedTuple
 
@@ -18,6 +18,9 @@ class Left(NamedTuple):
     filters: Array
     #: Mean square of the innovations, shape (R,).
     innovations: Array
+    #: Frequency of the largest ordinate before whitening [rad/sample], and its ratio to the noise floor, shape (R,).
+    peak: Array
+    peak_height: Array
 
     def noise(self, turn: Array) -> Array:
         """Return the mean square of white noise with the local density at frequencies [rad/sample], shape (R, n)."""
@@ -31,33 +34,45 @@ class Lines(NamedTuple):
 
     #: p-value under noise alone, shape (R,).
     chance: Array
-    #: Frequency [rad/sample], and ratio to the noise floor, shape (R,).
+    #: Frequency [rad/sample], ratio to the noise floor, and energy of the largest ordinate in units of the noise,
+    #: shape (R,).
     omega: Array
     height: Array
+    energy: Array
 
 
 def whiten(residuals: Array, fitted: IndexArray) -> Left:
     """Whiten rows of residuals of fits with ``fitted`` parameters by autoregressive models.
 
-    The models describe the noise only: ordinates far above the noise floor are clipped before.
+    The models describe the noise only: ordinates far above the noise floor are clipped before they are estimated.
     """
-    length = residuals.shape[1]
+    rows, length = residuals.shape
     there = np.isfinite(residuals)
     values = np.where(there, residuals, 0.0)
     power = periodogram(values * np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2)
     floor = running_floor(power, length)
+    peak = power.argmax(axis=1)
+    each = np.arange(rows)
+    height = power[each, peak] / np.maximum(floor[each, peak], c.SMALLEST_FLOOR)
     order = min(c.WHITENING_ORDER, max(1, length // c.SAMPLES_PER_ORDER))
     cosines = np.cos(np.outer(np.arange(order + 1), np.linspace(0.0, np.pi, power.shape[1])))
     # In the two-sided spectrum the first and the last ordinate occur once, all others twice.
-    cosines[:, 1:-1] *= 2.0
-    filters = prediction_errors(np.minimum(power, c.CUT * floor) @ cosines.T)
+    weighted = cosines.copy()
+    weighted[:, 1:-1] *= 2.0
+    filters = prediction_errors(np.minimum(power, c.CUT * floor) @ weighted.T)
+    for _ in range(c.WHITENING_ROUNDS - 1):
+        own = np.array([(filters[:, : order + 1 - k] * filters[:, k:]).sum(axis=1) for k in range(order + 1)])
+        own[1:] *= 2.0
+        gain = np.maximum(own.T @ cosines, c.SMALLEST_GAIN)
+        floor = running_floor(power * gain, length) / gain
+        filters = prediction_errors(np.minimum(power, c.CUT * floor) @ weighted.T)
     white = values.copy()
     for lag in range(1, order + 1):
         white[:, lag:] += filters[:, lag, None] * values[:, :-lag]
     white *= there
     squares = (white**2).sum(axis=1) / np.maximum(there.sum(axis=1) - fitted - order, 1)
     white /= np.sqrt(np.where(squares > 0.0, squares, 1.0))[:, None]
-    return Left(white, filters, squares)
+    return Left(white, filters, squares, np.pi * peak / (power.shape[1] - 1), height)
 
 
 def periodogram(values: Array) -> Array:
@@ -124,14 +139,21 @@ def spectrum_of(white: Array) -> Spectrum:
     )
 
 
-def strongest_lines(spectrum: Spectrum) -> Lines:
+def strongest_lines(left: Left, spectrum: Spectrum) -> Lines:
     """Find the strongest line of each row by the ratio of the periodogram to its running median."""
     place = spectrum.ratio.argmax(axis=1)
     height = spectrum.ratio[np.arange(place.size), place]
-    return Lines(spectrum.chance(height), place * spectrum.turn, height)
+    # The noise models have absorbed the skirts of a very strong line.
+    plain = left.peak_height > c.LINE_HEIGHT
+    return Lines(
+        np.where(plain, 0.0, spectrum.chance(height)),
+        np.where(plain, left.peak, place * spectrum.turn),
+        np.where(plain, left.peak_height, height),
+        np.where(plain, left.peak_height, spectrum.ordinates.max(axis=1) / spectrum.length),
+    )
 
 
-def new_lines(spectrum: Spectrum, tones: Array, change: Array) -> Array:
+def new_lines(left: Left, spectrum: Spectrum, tones: Array, change: Array) -> Array:
     """Return lines that do not belong to the tones of windows, the strongest first [rad/sample], shape (R, K).
 
     Missing ones are NaN. ``tones`` are the frequencies in the window [rad/sample], ``change`` the energies that a
@@ -140,6 +162,8 @@ def new_lines(spectrum: Spectrum, tones: Array, change: Array) -> Array:
     """
     bin_ = 2.0 * np.pi / spectrum.length
     ratio = spectrum.ratio.copy()
+    plain = left.peak_height > c.LINE_HEIGHT
+    ratio[plain, np.round(left.peak[plain] / spectrum.turn).astype(int)] = np.inf
     _clear(ratio, tones / spectrum.turn, int(c.APART * bin_ / spectrum.turn))
     found = np.full((ratio.shape[0], 1 + c.FURTHER), np.nan)
     rows, top = np.arange(ratio.shape[0]), np.zeros(ratio.shape[0])
@@ -165,33 +189,3 @@ def _clear(ratio: Array, places: Array, reach: int) -> None:
     row, column = np.nonzero(np.isfinite(places))
     near = np.round(places[row, column]).astype(int)[:, None] + np.arange(-reach, reach + 1)
     ratio[row[:, None], np.clip(near, 0, ratio.shape[1] - 1)] = 0.0
-
-
-def find_changes(left: Left, parameters: Array) -> tuple[Array, Array]:
-    """Return test statistics for changes of the tones within each window, two arrays of shape (R, n).
-
-    The first is the largest reduction of the sum of squares of the whitened residual by a change of phase and amplitude
-    at one instant, in units of the noise. The variance of the partial sums of a demodulated noise residual is reduced
-    by the fitted polynomials (phase 1, u, u^2; amplitude 1, u). The second is the sum of the demodulated residual's
-    quadrature times ``P3(u)``. ``parameters`` are NaN for a missing tone, shape (R, n, 5).
-    """
-    length = left.white.shape[1]
-    begin, u = max(1, int(c.ENDS * length)), np.linspace(-1.0, 1.0, length)
-    # Integrals of the orthonormal Legendre polynomials from -1 to v, squared.
-    x = np.arange(1, length + 1) / length
-    v = 2.0 * x - 1.0
-    of_amplitude = length * (x - x**2 - 3.0 * (0.25 * (v**2 - 1.0)) ** 2)
-    of_phase = of_amplitude - length * 5.0 * (0.25 * (v**3 - v)) ** 2
-    inside = slice(begin, length - begin)
-    energy, cube = np.full((2, *parameters.shape[:2]), np.nan)
-    for k in range(parameters.shape[1]):
-        rows = np.flatnonzero(np.isfinite(parameters[:, k, 3]))
-        cosine, sine, _, turn, bend = parameters[rows, k].T
-        lags = np.arange(left.filters.shape[1])
-        response = (left.filters[rows] * np.exp(-2j * np.outer(turn, lags) / (length - 1))).sum(axis=1)
-        phase = np.angle(response) - np.arctan2(sine, cosine)
-        turned = left.white[rows] * np.exp(-1j * (phase[:, None] + np.outer(turn, u) + np.outer(bend, u**2)))
-        sums = np.cumsum(turned, axis=1)[:, inside]
-        energy[rows, k] = (sums.real**2 / of_amplitude[inside] + sums.imag**2 / of_phase[inside]).max(axis=1)
-        cube[rows, k] = turned.imag @ (0.5 * (5.0 * u**2 - 3.0) * u)
-    return energy, cube

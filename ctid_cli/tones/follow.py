@@ -8,12 +8,13 @@ from scipy.optimize import linear_sum_assignment
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.tones import constants as c
 from ctid_cli.tones.check import Readings, explained, moving, readings_of
-from ctid_cli.tones.tone_kernels import keep_readings
-from ctid_cli.tones.window_fit import fit_steady, fit_tones
+from ctid_cli.tones.find import floor_bins
+from ctid_cli.tones.tone_kernels import PARAMETERS, keep_readings
+from ctid_cli.tones.window_fit import WindowTones, fit_steady, fit_tones, nearest
 
 
 def readings_at(
-    samples: Array, places: Array, longest: int, on_progress: Callable[[int, int], None] | None = None
+    samples: Array, places: Array, longest: int, tell: Callable[[int, int], None] | None = None
 ) -> Readings:
     """Return the tones of a signal at ascending places [samples], each from its longest undisturbed window."""
     if longest == samples.size and (steady := fit_steady(samples)) is not None:
@@ -21,12 +22,13 @@ def readings_at(
         if explained(steady, longest) and not (found.gap > 0.0).any():
             return found.at(np.lexsort((found.omega, found.row)))
     parts: list[Readings] = []
+    tones: WindowTones | None = None
     lengths = [c.SHORTEST * 2**k for k in range(64) if c.SHORTEST * 2**k < longest] + [longest]
-    for done, length in enumerate(lengths):
-        if on_progress is not None:
-            on_progress(done, len(lengths))
-        first = _windows(length, samples.size, places)
-        parts.append(readings_of(fit_tones(samples, length, first, c.MOST_LINES), length, places))
+    for done, (length, first) in enumerate(zip(lengths, _windows(lengths, samples.size, places), strict=True)):
+        if tell is not None:
+            tell(done, len(lengths))
+        tones = fit_tones(samples, length, first, c.MOST_LINES, tones)
+        parts.append(readings_of(tones, length, places))
     # The longest windows first; at equal length, the one with the nearest middle.
     found = Readings(*(np.concatenate(each) for each in zip(*parts[::-1], strict=True)))
     found = found.at(np.argsort(found.row, kind="stable"))
@@ -38,17 +40,27 @@ def readings_at(
     return found.at(np.lexsort((found.omega, found.row)))
 
 
-def _windows(length: int, count: int, places: Array) -> IndexArray:
-    """Return the first samples of the windows of a length that contain a place."""
-    first = np.unique(np.append(np.arange(0, count - length + 1, length // c.HOPS), count - length))
-    return first[np.searchsorted(places, first + length - 0.5) > np.searchsorted(places, first - 0.5)]
+def _windows(lengths: list[int], count: int, places: Array) -> list[IndexArray]:
+    """Return the first samples of the windows of each length that contain a place or provide starts for longer ones.
+
+    If places are far apart, most of the short windows lie between them and are omitted.
+    """
+    chosen: list[IndexArray] = []
+    longer: Array = np.empty(0)
+    for length in reversed(lengths):
+        first = np.unique(np.append(np.arange(0, count - length + 1, length // c.HOPS), count - length))
+        wanted = np.searchsorted(places, first + length - 0.5) > np.searchsorted(places, first - 0.5)
+        wanted[nearest(first + 0.5 * (length - 1), longer)] = True
+        chosen.append(first[wanted])
+        longer = np.asarray(chosen[-1] + 0.5 * (length - 1), dtype=np.float64)
+    return chosen[::-1]
 
 
 def paths_of(found: Readings, places: Array) -> list[IndexArray]:
     """Return the readings of each tone, the strongest tone first."""
     step = float(np.median(np.diff(places))) if places.size > 1 else 1.0
-    paths = _joined(_followed(found, places, step), found)
-    paths = [path for path in paths if _lasts(found, path, places, step)]
+    paths = _joined(_followed(found, places, step), found, places.size)
+    paths = [path for path in paths if _described(found, path, places, step)]
     # Sorted by duration times amplitude, so that long tones precede short loud ones.
     return _merged(sorted(paths, key=lambda path: -path.size * float(np.median(found.amplitude[path]))), found)
 
@@ -113,13 +125,13 @@ def _misfit(found: Readings, before: IndexArray, here: IndexArray, places: Array
     return np.asarray(off / np.maximum(c.GATE_BINS * bin_, c.GATE_ERRORS * errors))
 
 
-def _joined(paths: list[IndexArray], found: Readings) -> list[IndexArray]:
+def _joined(paths: list[IndexArray], found: Readings, rows: int) -> list[IndexArray]:
     """Join the segments of one tone, the closest segments first."""
     ends = np.array([(found.row[p[0]], found.row[p[-1]]) for p in paths]).reshape(-1, 2)
     omega = np.array([(found.omega[p[0]], found.omega[p[-1]]) for p in paths]).reshape(-1, 2)
     pause = ends[None, :, 0] - ends[:, None, 1]
     jump = np.abs(omega[None, :, 0] / omega[:, None, 1] - 1.0)
-    cost = np.where(pause > 0, jump, np.inf)
+    cost = np.where(pause > 0, jump + c.PAUSE * pause / rows, np.inf)
     after: dict[int, int] = {}
     taken: set[int] = set()
     for pair in np.argsort(cost, axis=None):
@@ -140,8 +152,17 @@ def _joined(paths: list[IndexArray], found: Readings) -> list[IndexArray]:
     return joined
 
 
-def _lasts(found: Readings, path: IndexArray, places: Array, step: float) -> bool:
-    """Return whether a tone is certain at some row, and lasts as long as the window of that row."""
-    long_enough = np.minimum(found.window[path], places[-1] - places[0])
+def _described(found: Readings, path: IndexArray, places: Array, step: float) -> bool:
+    """Return whether a tone lasts for one of its windows and reduces the minimum description length.
+
+    The cost of a tone includes its parameters and the position of its window.
+    """
+    sure = found.resolved[path] & found.significant[path] & (found.error[path] < c.COARSE * found.omega[path])
+    window = found.window[path]
+    # The noise level near a line is uncertain, as in the test that finds lines.
+    known = c.MEDIAN_EFFICIENCY * np.minimum(float(floor_bins(4 * c.FLOOR_BINS)), 0.5 * window)
+    gain = known * np.log1p(0.5 * (found.amplitude[path] / found.amplitude_error[path]) ** 2 / known)
+    worth = gain > 0.5 * PARAMETERS * np.log(window) + np.log(np.maximum(1.0, places[-1] / window))
+    long_enough = np.minimum(window, places[-1] - places[0])
     lasting = places[found.row[path[-1]]] - places[found.row[path[0]]] + 2.0 * step >= long_enough
-    return bool((found.resolved[path] & found.significant[path] & lasting).any())
+    return bool((sure & worth & lasting).any())

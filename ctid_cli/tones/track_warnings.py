@@ -50,9 +50,9 @@ def _invalid_rows(track: Track) -> list[str]:
     for k, (flags, there) in enumerate(zip(track.flags.T, track.there.T, strict=True)):
         if reasons := _reasons(flags[there]):
             found.setdefault(reasons, []).append(f"tone {k + 1}")
-    messages = [f"{listed(tones).capitalize()}: {reasons}" for reasons, tones in found.items()]
-    more = [f"{count(len(messages) - MOST_WARNINGS, 'more tone')} with rows that are not valid."]
-    return messages if len(messages) <= MOST_WARNINGS else messages[:MOST_WARNINGS] + more
+    said = [f"{listed(tones).capitalize()}: {reasons}" for reasons, tones in found.items()]
+    more = [f"{count(len(said) - MOST_WARNINGS, 'more tone')} with rows that are not valid."]
+    return said if len(said) <= MOST_WARNINGS else said[:MOST_WARNINGS] + more
 
 
 def _reasons(flags: NDArray[np.uint16]) -> str:

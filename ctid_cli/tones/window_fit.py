@@ -7,9 +7,8 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.processors import in_threads
 from ctid_cli.tones import constants as c
-from ctid_cli.tones.find import Left, Lines, find_changes, new_lines, spectrum_of, strongest_lines, whiten
-from ctid_cli.tones.least_squares import Fits, covariances_of, fit_windows
-from ctid_cli.tones.tone_kernels import PARAMETERS, normal_equations
+from ctid_cli.tones.find import Left, Lines, new_lines, spectrum_of, strongest_lines, whiten
+from ctid_cli.tones.tone_kernels import PARAMETERS, find_changes, fit_windows
 
 
 class WindowTones(NamedTuple):
@@ -46,6 +45,16 @@ class WindowTones(NamedTuple):
     converged: BoolArray
 
 
+class _Fits(NamedTuple):
+    """Windows and the parameters of their tones, modified by the compiled fit."""
+
+    first: IndexArray
+    used: IndexArray
+    parameters: Array
+    covariances: Array
+    converged: BoolArray
+
+
 class _Limits(NamedTuple):
     """Largest numbers of lines of a window, of rounds that add lines, and of steps of a stage in each round."""
 
@@ -69,12 +78,14 @@ class _Tests(NamedTuple):
     joining: Array
 
 
-def fit_tones(samples: Array, length: int, first: IndexArray, most: int) -> WindowTones:
-    """Fit the tones of windows of one length."""
+def fit_tones(
+    samples: Array, length: int, first: IndexArray, most: int, shorter: WindowTones | None = None
+) -> WindowTones:
+    """Fit the tones of windows of one length, starting from those of shorter windows."""
     most = max(1, min(most, (length // c.SAMPLES_PER_PARAMETER - 1) // PARAMETERS))
     size = max(1, c.BLOCK_SAMPLES // length)
     parts = [first[k : k + size] for k in range(0, first.size, size)]
-    blocks = in_threads(lambda part: _block(samples, length, part, most), parts)
+    blocks = in_threads(lambda part: _block(samples, length, part, most, shorter), parts)
     tones = WindowTones(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
     # One empty column is kept if possible: windows without one are full.
     kept = int(np.isfinite(tones.omega).sum(axis=1).max()) + 1
@@ -87,41 +98,45 @@ def fit_steady(samples: Array) -> WindowTones | None:
     A fit that does not converge quickly is also None.
     """
     length = samples.size
-    fits, tests = _fitted(samples, length, np.zeros(1, np.int64), _STEADY)
+    fits, tests, residuals = _fitted(samples, length, np.zeros(1, np.int64), _STEADY, None)
     unexplained = (tests.lines.chance < c.LEVEL) | ~fits.converged
     if unexplained.any() or not fits.used.any():
         return None
-    residual, shorter = _equations(samples, length, fits)[3][0], length // c.STEADY_STEP
+    shorter = length // c.STEADY_STEP
     while shorter >= c.SHORTEST:
-        parts = residual[: length // shorter * shorter].reshape(-1, shorter)
+        parts = residuals[0, : length // shorter * shorter].reshape(-1, shorter)
         together = max(1, c.BLOCK_SAMPLES // shorter)
         for begin in range(0, len(parts), together):
             some = parts[begin : begin + together]
             left = whiten(some, np.zeros(len(some), np.int64))
-            if (strongest_lines(spectrum_of(left.white)).chance < c.LEVEL / len(parts)).any():
+            if (strongest_lines(left, spectrum_of(left.white)).chance < c.LEVEL / len(parts)).any():
                 return None
         shorter //= c.STEADY_STEP
-    return _tones(samples, length, fits, tests)
+    return _tones(fits, tests, length)
 
 
-def _block(samples: Array, length: int, first: IndexArray, most: int) -> WindowTones:
-    fits, tests = _fitted(samples, length, first, _Limits(most, most, c.MOST_STEPS))
-    return _tones(samples, length, fits, tests)
+def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: WindowTones | None) -> WindowTones:
+    fits, tests, _ = _fitted(samples, length, first, _Limits(most, most, c.MOST_STEPS), shorter)
+    return _tones(fits, tests, length)
 
 
-def _fitted(samples: Array, length: int, first: IndexArray, limits: _Limits) -> tuple[Fits, _Tests]:
-    """Return fits and tests of their residuals."""
-    windows = np.lib.stride_tricks.sliding_window_view(samples, length)[first]
-    there = np.isfinite(windows)
-    count = there.sum(axis=1)
-    means = np.where(there, windows, 0.0).sum(axis=1) / np.maximum(count, 1)
-    used, tones = np.zeros(first.size, np.int64), np.zeros((first.size, limits.lines, PARAMETERS))
-    fits = Fits(first, count, used, tones, means, np.zeros(first.size, np.bool_))
+def _fitted(
+    samples: Array, length: int, first: IndexArray, limits: _Limits, shorter: WindowTones | None
+) -> tuple[_Fits, _Tests, Array]:
+    """Return fits, tests of their residuals, and the residuals, shape (R, L)."""
+    most = limits.lines
+    rows, shape = first.size, (first.size, most, PARAMETERS)
+    fits = _Fits(
+        first, np.zeros(rows, np.int64), np.zeros(shape), np.zeros((*shape, PARAMETERS)), np.zeros(rows, np.bool_)
+    )
+    if shorter is not None:
+        _start(fits, length, shorter)
+    residuals = np.empty((rows, length))
     tests: _Tests | None = None
-    todo = np.arange(first.size)
+    todo = np.arange(rows)
     for round_ in range(limits.rounds + 1):
-        fit_windows(samples, length, fits, todo, limits.steps)
-        new = _tested(samples, length, Fits._make(each[todo] for each in fits))
+        fit_windows(samples, length, first, todo, limits.steps, *fits[1:], residuals)
+        new = _tested(residuals[todo], fits, todo)
         tests = new if tests is None else _replaced(tests, todo, new)
         if round_ == limits.rounds:
             break
@@ -133,10 +148,31 @@ def _fitted(samples: Array, length: int, first: IndexArray, limits: _Limits) -> 
         if not todo.size:
             break
     assert tests is not None
-    return fits, tests
+    return fits, tests, residuals
 
 
-def _join(fits: Fits, rows: IndexArray, turns: Array) -> BoolArray:
+def nearest(middles: Array, places: Array) -> IndexArray:
+    """Return the index of the nearest of the ascending ``middles`` for each place."""
+    return np.asarray(np.searchsorted(0.5 * (middles[1:] + middles[:-1]), places))
+
+
+def _start(fits: _Fits, length: int, shorter: WindowTones) -> None:
+    """Start from the significant tones of the nearest shorter windows, if these fits passed all tests."""
+    half = 0.5 * (length - 1)
+    middle: Array = np.asarray(fits.first + half, dtype=np.float64)
+    beginning = nearest(shorter.middle, middle)
+    clean = shorter.converged & (shorter.line_chance >= c.LEVEL) & ~(shorter.change_chance < c.LEVEL).any(axis=1)
+    sure = clean[:, None] & (shorter.amplitude > c.SURE * shorter.amplitude_error)
+    for j in range(min(shorter.omega.shape[1], fits.parameters.shape[1])):
+        rows = np.flatnonzero(sure[beginning, j])
+        of, place = beginning[rows], fits.used[rows]
+        omega = shorter.omega[of, j] + shorter.rate[of, j] * (middle[rows] - shorter.middle[of])
+        fits.parameters[rows, place, 3] = omega * half
+        fits.parameters[rows, place, 4] = 0.5 * shorter.rate[of, j] * half**2
+        fits.used[rows] += 1
+
+
+def _join(fits: _Fits, rows: IndexArray, turns: Array) -> BoolArray:
     """Add a line to each window that has a candidate and room for it; return the mask of these windows."""
     fits_in: BoolArray = np.isfinite(turns) & (fits.used[rows] < fits.parameters.shape[1])
     rows, turns = rows[fits_in], turns[fits_in]
@@ -146,22 +182,15 @@ def _join(fits: Fits, rows: IndexArray, turns: Array) -> BoolArray:
     return fits_in
 
 
-def _equations(samples: Array, length: int, fits: Fits) -> tuple[Array, Array, Array, Array]:
-    """Return the costs, gradients, normal matrices and residuals of fits."""
-    tones = np.ascontiguousarray(fits.parameters[:, : fits.used.max()])
-    return normal_equations(samples, length, fits.first, fits.used, tones, fits.constants)
-
-
-def _tested(samples: Array, length: int, fits: Fits) -> _Tests:
-    """Test the residuals of fits for lines and changes."""
-    half = 0.5 * (length - 1)
-    left = whiten(_equations(samples, length, fits)[3], PARAMETERS * fits.used + 1)
-    empty = np.arange(fits.parameters.shape[1]) >= fits.used[:, None]
-    parameters = np.where(empty[:, :, None], np.nan, fits.parameters)
-    change, cube = find_changes(left, parameters)
+def _tested(residuals: Array, fits: _Fits, rows: IndexArray) -> _Tests:
+    left = whiten(residuals, PARAMETERS * fits.used[rows] + 1)
+    change, cube = np.full((2, rows.size, fits.parameters.shape[1]), np.nan)
+    find_changes(left.white, left.filters, fits.parameters[rows], fits.used[rows], change, cube)
     spectrum = spectrum_of(left.white)
-    joining = new_lines(spectrum, parameters[:, :, 3] / half, change)
-    return _Tests(left._replace(white=np.empty((len(empty), 0))), strongest_lines(spectrum), change, cube, joining)
+    half = 0.5 * (residuals.shape[1] - 1)
+    empty = np.arange(change.shape[1]) >= fits.used[rows, None]
+    joining = new_lines(left, spectrum, np.where(empty, np.nan, fits.parameters[rows, :, 3] / half), change)
+    return _Tests(left._replace(white=np.empty((rows.size, 0))), strongest_lines(left, spectrum), change, cube, joining)
 
 
 def _replaced(old: _Tests, rows: IndexArray, new: _Tests) -> _Tests:
@@ -172,7 +201,7 @@ def _replaced(old: _Tests, rows: IndexArray, new: _Tests) -> _Tests:
     return old
 
 
-def _tones(samples: Array, length: int, fits: Fits, tests: _Tests) -> WindowTones:
+def _tones(fits: _Fits, tests: _Tests, length: int) -> WindowTones:
     """Convert parameters to units per sample, with standard errors from the noise near each tone."""
     half = 0.5 * (length - 1)
     empty = np.arange(fits.parameters.shape[1]) >= fits.used[:, None]
@@ -180,9 +209,7 @@ def _tones(samples: Array, length: int, fits: Fits, tests: _Tests) -> WindowTone
     noise = np.where(empty, np.nan, tests.left.noise(np.where(empty, 0.0, turn / half)))
     amplitude = np.hypot(cosine, sine)
     with np.errstate(invalid="ignore", divide="ignore"):
-        inverses = covariances_of(_equations(samples, length, fits)[2], fits.used)
-        covariances = np.full((*noise.shape, PARAMETERS, PARAMETERS), np.nan)
-        covariances[:, : inverses.shape[1]] = noise[:, : inverses.shape[1], None, None] * inverses
+        covariances = noise[:, :, None, None] * fits.covariances
         errors = np.sqrt(np.diagonal(covariances, axis1=2, axis2=3))
         # Gradient of the logarithm of the amplitude with respect to both amplitudes.
         weights = np.stack((cosine, sine), axis=2) / amplitude[:, :, None] ** 2
