@@ -14,6 +14,7 @@ import numpy as np
 from ctid_cli.estimation.common import check_greatest_delay
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import answer_of
+from ctid_cli.estimators.measured_fit import MultiInputFit
 from ctid_cli.identification import sentences
 from ctid_cli.identification.candidates import Setting, Several, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
@@ -28,13 +29,13 @@ from ctid_cli.identification.initial_states import (
     without_beginning,
 )
 from ctid_cli.identification.parts import parts_of
+from ctid_cli.identification.remedies import without_harmful_outliers
 from ctid_cli.inference.input_response import analyse_response
-from ctid_cli.inference.record_facts import gross_outliers
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.models.several_inputs import AnyModel, delays_of
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record, as_records
-from ctid_cli.signals.treatment import Holds, LossKind
+from ctid_cli.signals.treatment import Holds
 
 #: Greatest delay that is tried, and its limit if the record shows a later response, as shares of the record.
 LATEST, LATER = 0.1, 0.5
@@ -79,7 +80,25 @@ def choose(records: Record | Sequence[Record], given: Given | None = None, time_
     if given.delays_given is not None:
         for record in several:
             check_greatest_delay(record, given.delays_given[1])
-    return _Choosing(several, given, time_unit).choice()
+    choice = _Choosing(several, given, time_unit).choice()
+    best = choice.ranking.best
+    if given.loss is not None or given.noise_model != "white" or isinstance(best.fit, MultiInputFit):
+        return choice
+    clean = without_harmful_outliers(choice.fitted, best.options, best.fit)
+    if clean is None:
+        return choice
+    # All else is chosen again, without the outliers.
+    instants = [
+        record.t[np.isnan(kept.y) & ~np.isnan(record.y)] for record, kept in zip(choice.fitted, clean, strict=True)
+    ]
+    several = [
+        replace(record, y=np.where(np.isin(record.t, at), np.nan, record.y))
+        for record, at in zip(several, instants, strict=True)
+    ]
+    chosen = _Choosing(several, replace(given, loss="tukey"), time_unit).choice()
+    held = tuple(with_hold(record, chosen.records[0].hold) for record in choice.records)
+    left_out = sentences.of_outliers(sum(map(len, instants)))
+    return replace(chosen, records=held, sentences=(left_out, *chosen.sentences))
 
 
 class _Choosing:
@@ -92,16 +111,6 @@ class _Choosing:
         self.first_reasons = [sentences.NO_INTEGRATOR] if drifts else []
         # A periodic state is that of the whole record.
         self.part, self.from_start = (records, True) if given.initial_state == "periodic" else parts_of(records)
-        self.loss: LossKind = given.loss or "squares"
-        if given.loss is None and given.noise_model == "white":
-            instants = [gross_outliers(record) for record in self.part]
-            if any(instants):
-                self.loss = "tukey"
-                self.first_reasons.insert(0, sentences.of_outliers(sum(map(len, instants))))
-                self.part = [
-                    replace(record, y=np.where(np.isin(record.t, at), np.nan, record.y))
-                    for record, at in zip(self.part, instants, strict=True)
-                ]
         self.several = Several(given.delays_of_inputs, not isinstance(given.zeros, int))
         self.first_hold: Holds = "zoh" if given.hold == "auto" else given.hold
         self.reasons: list[str] = []
@@ -141,7 +150,7 @@ class _Choosing:
     def _chosen(self, options: Searched, setting: Setting, ranking: Ranking, about: Sequence[str]) -> Choice:
         """Return a choice with its sentences."""
         best = ranking.best
-        options = replace(options, loss=self.loss, noise_model=self.given.noise_model)
+        options = replace(options, loss=self.given.loss or "squares", noise_model=self.given.noise_model)
         if isinstance(options, DelayProfile):
             options = replace(options, fixed=self.given.fixed, bounds=self.given.bounds, nested=True)
         if not self.from_start:

@@ -121,6 +121,20 @@ def tried_remedies(
     return found
 
 
+def without_harmful_outliers(
+    records: tuple[Record, ...], options: Options, fit: MeasuredFit
+) -> tuple[Record, ...] | None:
+    """Return the records with the outliers of a fit as missing if another loss helps; else None."""
+    found = Trials([], [])
+    try:
+        clean = without_outliers(records, fit)
+        if clean is not None and isinstance(options, DelayProfile):
+            _with_best(FittedOptions(options, records[0].hold, records, fit), ("loss",), found)
+    except CtidError:
+        return None
+    return clean if found.remedies else None
+
+
 def without_outliers(records: Sequence[Record], fit: MeasuredFit) -> tuple[Record, ...] | None:
     """Return the records with the outliers of a fit as missing; None if there are none."""
     law, found, total = fit.linear, [], 0

@@ -26,7 +26,6 @@ from ctid_cli.inference.signal_features import (
     input_moves,
     outliers,
     quantum,
-    residual_outliers,
     saturated,
 )
 from ctid_cli.signals.held import HeldSignal
@@ -202,20 +201,6 @@ def _response_p_value(record: Record) -> float:
     moved = HeldSignal(signal.t, signal.values - signal.at(record.t[:1]), signal.hold)
     test = response_test([replace(record, inputs=moved)], [record.valid], (0.0, LONGEST_DELAY * record.duration))
     return test.p_value
-
-
-def gross_outliers(record: Record) -> tuple[float, ...]:
-    """Return the instants of gross outliers of an output besides its response; none where that cannot be modelled."""
-    used = np.flatnonzero(record.valid)
-    if record.several or used.size < FEWEST_SAMPLES or np.ptp(record.y[used]) == 0.0:
-        return ()
-    if input_moves(record).kind == "constant":
-        return ()
-    interval = float(np.median(np.diff(record.t)))
-    y = record.y[used] - np.median(record.y[used])
-    model = fit_response(Signals(record.t[used], y, record.input, interval))
-    _, rest = model.parts(slow_columns(model, slow_terms(model, ())))
-    return tuple(record.t[used[residual_outliers(rest)[0]]].tolist())
 
 
 def decompose(record: Record) -> Decomposition:

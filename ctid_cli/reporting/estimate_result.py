@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -21,12 +21,6 @@ from ctid_cli.storage.estimates import as_object
 if TYPE_CHECKING:
     from ctid_cli.storage.estimates import Estimates
     from ctid_cli.storage.manifest import Slot
-
-#: Meaning of the names of parameters.
-NAMES = (
-    "a1, b0: one fraction, monic denominator, descending powers. g1_a2: coefficient of p^2 in the denominator of the "
-    "slowest submodel, which ends in 1."
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +90,21 @@ class EstimateResult(Result):
         notes = [f"True delay: {number(row['true_delay'])} s."] if row.get("true_delay") is not None else []
         if not self.parameters:
             return Section(notes=notes)
-        return Section.table(self.parameters, PARAMETER, notes=[f"{NAMES} {_interval(row)}", *notes])
+        return Section.table(
+            self.parameters,
+            PARAMETER,
+            notes=[" ".join([*_conventions([one.name for one in self.parameters]), _interval(row)]), *notes],
+        )
+
+
+def _conventions(names: Collection[str]) -> list[str]:
+    """Return the meaning of the names of parameters."""
+    if not any(name.startswith("g") for name in names):
+        return ["Monic denominator, descending powers."]
+    lines = ["g1: submodel of the least natural frequency; g1_a2: coefficient of p^2 in its denominator (ends in 1)."]
+    if "a1" in names:
+        lines.append("a1, b0: all submodels as one fraction with a monic denominator, descending powers.")
+    return lines
 
 
 def _facts(row: Mapping[str, Any]) -> Section:

@@ -265,8 +265,8 @@ class ArmaNoise(Noise):
     --------
     >>> from ctid_cli.signals.noise import ArmaNoise
     >>> noise = ArmaNoise(numerator=(1.0, 0.5), denominator=(1.0, -0.85), innovation_variance=0.02)
-    >>> round(noise.variance_of(), 6)
-    0.151351
+    >>> noise.autocovariance([0]).round(6).tolist()
+    [0.151351]
     """
 
     kind: ClassVar[str] = "arma"

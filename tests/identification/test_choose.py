@@ -206,7 +206,7 @@ def test_a_validation_record_does_not_change_the_model():
 def test_no_response_is_no_model():
     noise = record_of(SECOND)
     noise = Record(noise.t, np.random.default_rng(5).standard_normal(600), noise.input)
-    assert not choose(noise).seen
+    assert not choose(noise).has_model
     with pytest.raises(DataError, match="No model"):
         identify(noise)
 
