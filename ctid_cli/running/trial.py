@@ -167,6 +167,7 @@ def _try_under_limits(limits: Limits, late: Path, *given: Any) -> Found:
 
 def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], success: Mapping[str, Any]) -> Found:
     """Simulate the first data set of each setting, and prepare every estimator on it."""
+    from ctid_cli.estimators.svf import Svf
     from ctid_cli.simulation.expected_accuracy import why_biased
 
     found, end = Found(), time.monotonic() + MAX_SECONDS
@@ -189,9 +190,9 @@ def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], succe
                     unusable = _unusable(candidate.estimator, data)
                     tried[name].append(swept)
                     failures[name] += [(("estimators", name), unusable, swept)] if unusable else []
-                    # The documentation of svf says what it is for.
-                    known = candidate.estimator.kind == "svf"
-                    why = "" if known else why_biased(setting.cell.source, candidate.estimator)
+                    # The documentation of svf says that it is a start for others.
+                    start = isinstance(candidate.estimator, Svf)
+                    why = "" if start else why_biased(setting.cell.source, candidate.estimator)
                     biased[name] += [(("estimators", name), f"is biased: {why}", swept)] if why else []
                 if first and not unusable and (candidate.is_custom or setting.cell.measures):
                     _fit(candidate, data, setting, [one.estimator for one in candidates], success, found)
