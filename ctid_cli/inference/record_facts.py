@@ -20,14 +20,7 @@ from ctid_cli.inference.response_estimates import (
 from ctid_cli.inference.response_model import Signals, fit_response
 from ctid_cli.inference.response_test import LEVEL as NO_RESPONSE
 from ctid_cli.inference.response_test import response_test
-from ctid_cli.inference.signal_features import (
-    InputMoves,
-    growth_time,
-    input_moves,
-    outliers,
-    quantum,
-    saturated,
-)
+from ctid_cli.inference.signal_features import InputMoves, growth_time, input_moves, outliers, quantum, saturated
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 

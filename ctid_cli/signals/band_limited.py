@@ -12,8 +12,6 @@ by a Kaiser window after 32 samples, and the signal is extended beyond the ends 
 end samples.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from ctid_cli.arrays import Array
@@ -22,24 +20,11 @@ from ctid_cli.arrays import Array
 FINER = 4
 #: Number of samples on each side used for an instant between two samples, and the parameter of their window (80 dB).
 REACH, KAISER = 32, 8.0
-#: Above this fraction of half the sampling frequency, images pass the window.
-PASSED = 0.9
-
-
-class BandLimitedDoubt(NamedTuple):
-    """Uncertainty of a signal between its samples."""
-
-    #: Distance from both ends within which the unknown samples outside matter [s].
-    reach: float
-    #: Root mean square change there under another assumption about these samples [input unit].
-    ends: float
-    #: Fraction of the signal's power too close to half the sampling frequency [-].
-    beyond: float
 
 
 def finer_values(values: Array) -> Array:
     """Return points from the first to the last sample whose connecting lines have the spectrum of a signal."""
-    return _of_window(values, "odd")
+    return _of_window(values)
 
 
 def periodic_values(values: Array) -> Array:
@@ -54,7 +39,7 @@ def periodic_values(values: Array) -> Array:
 
 def values_between(values: Array) -> Array:
     """Return the signal itself on the finer clock, from the first sample to the last."""
-    return _of_window(values, "odd", undamped=False)
+    return _of_window(values, undamped=False)
 
 
 def finer_times(t: Array, *, periodic: bool) -> Array:
@@ -67,23 +52,10 @@ def finer_times(t: Array, *, periodic: bool) -> Array:
     return np.append(times, t[-1] + step * np.arange(1, FINER))
 
 
-def band_limited_doubt(t: Array, values: Array) -> BandLimitedDoubt:
-    """Return the effect of another assumption about samples outside the record, and the power near the band edge."""
-    mirrored, held = (_of_window(values, way) for way in ("odd", "constant"))
-    edge = min(REACH * FINER, mirrored.size // 2)
-    off = np.concatenate([(mirrored - held)[:edge], (mirrored - held)[-edge:]])
-    n = values.size
-    power = np.abs(np.fft.rfft((values - values.mean()) * np.hanning(n))) ** 2
-    total = float(power.sum())
-    beyond = float(power[int(PASSED * (power.size - 1)) :].sum()) / total if total > 0 else 0.0
-    interval = float(t[-1] - t[0]) / (n - 1)
-    return BandLimitedDoubt(min(REACH, n // 2) * interval, float(np.sqrt(np.mean(off**2))), beyond)
-
-
-def _of_window(values: Array, beyond: str, *, undamped: bool = True) -> Array:
-    """Return points by the windowed sum; outside, the signal is reflected (``odd``) or held at its end samples."""
+def _of_window(values: Array, *, undamped: bool = True) -> Array:
+    """Return points by the windowed sum; outside, the signal is reflected, and a single sample is held."""
     more = REACH + 2
-    if beyond == "odd" and values.size > 1:
+    if values.size > 1:
         longer = np.pad(values, more, mode="reflect", reflect_type="odd")
     else:
         longer = np.pad(values, more, mode="edge")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli import HeldSignal, TransferFunction, simulate
-from ctid_cli.signals.band_limited import FINER, REACH, band_limited_doubt
+from ctid_cli.signals.band_limited import FINER, REACH
 
 INTERVAL, PERIOD = 0.2, 400
 MODELS = {
@@ -69,20 +69,3 @@ def test_values_between_the_samples():
     assert signal.at(within) == pytest.approx(waves(within, w, phases), abs=0.02 * signal.values.std())
     constant = HeldSignal(t, np.full(t.size, 3.0), "band-limited")
     assert constant.lines.values == pytest.approx(np.full(constant.lines.t.size, 3.0), rel=1e-12)
-
-
-def test_what_is_not_known_at_the_ends():
-    t = INTERVAL * np.arange(PERIOD)
-    w, phases = period(0.6)
-    wide, narrow = (band_limited_doubt(t, waves(t, *period(top))) for top in (0.97, 0.2))
-    assert wide.beyond > 0.01 > narrow.beyond
-    assert narrow.ends < 0.2 * wide.ends
-    # The estimated uncertainty is of the size of the error.
-    values = waves(t, w, phases)
-    lines = HeldSignal(t, values, "band-limited").lines
-    damped = np.sinc(w * INTERVAL / FINER / (2 * np.pi)) ** 2
-    edge = REACH * FINER
-    off = (lines.values - waves(lines.t, w, phases, 1 / damped))[np.r_[:edge, -edge:0]]
-    doubt = band_limited_doubt(t, values)
-    assert doubt.reach == pytest.approx(REACH * INTERVAL)
-    assert 0.2 < doubt.ends / np.sqrt(np.mean(off**2)) < 5
