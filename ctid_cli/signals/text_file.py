@@ -6,13 +6,16 @@ import io
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import datetime
 from functools import partial
 from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.data_checks import Rows
 from ctid_cli.signals.files import quoted, require_file
@@ -35,6 +38,8 @@ COMMENTS = ("#", "%", "//")
 MISSING = ("", "nan", "NaN", "NAN", "na", "NA", "N/A", "#N/A")
 #: Digits, a sign and digits again, as in 2024-03-01, 1/3/24 or 12:30.
 DATE = re.compile(r"\d[-/.]\d{1,2}[-/.]\d|\d:\d\d")
+#: A date with a time of day after ISO 8601, possibly with a blank between them.
+INSTANT = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?(Z|[+-]\d\d(:?\d\d)?)?")
 #: A number by its decimal sign.
 NUMBERS = {
     sign: re.compile(rf"[+-]?(\d+{mark}?\d*|{mark}\d+)(e[+-]?\d+)?|[+-]?inf(inity)?|true|false", re.IGNORECASE)
@@ -47,7 +52,10 @@ FORMATS = "records are read from text (.csv, .txt), MATLAB files (.mat) and HDF5
 
 @dataclass(frozen=True)
 class Layout:
-    """Layout of a file: encoding, separators, columns, and line numbers of names and first sample."""
+    """Layout of a file: encoding, separators, columns, and line numbers of names and first sample.
+
+    Columns of dates have the first of them in ``origins``, by their place; times in seconds are counted from there.
+    """
 
     path: str | os.PathLike[str]
     encoding: str
@@ -58,6 +66,7 @@ class Layout:
     first: int
     notes: tuple[str, ...]
     comments: tuple[tuple[int, str], ...]
+    origins: dict[int, str]
 
     def opened(self) -> io.TextIOBase:
         """Open the file at its first sample."""
@@ -116,7 +125,11 @@ def _layout(path: str | os.PathLike[str], file: str) -> Layout:
     decimal = _decimal(chain.from_iterable(fields for _, fields in rows[1:]))
     if decimal == ",":
         notes.append("Numbers were read with decimal commas.")
-    return Layout(path, encoding, separator, decimal, tuple(names), header, rows[1][0], tuple(notes), tuple(comments))
+    origins = _origins(names, [fields for _, fields in rows[1:]])
+    first = rows[1][0]
+    return Layout(
+        path, encoding, separator, decimal, tuple(names), header, first, tuple(notes), tuple(comments), origins
+    )
 
 
 def _head(path: str | os.PathLike[str], file: str) -> tuple[str, str]:
@@ -186,6 +199,15 @@ def _decimal(fields: Iterable[str]) -> str:
     return "," if found.count(",") > found.count(".") else "."
 
 
+def _origins(names: Sequence[str], rows: Sequence[Sequence[str]]) -> dict[int, str]:
+    """Return the first date of every column that has only dates with a time of day and, if any, the unit second."""
+    found = {}
+    for place, (name, *fields) in enumerate(zip_longest(names, *rows, fillvalue="")):
+        if all(map(INSTANT.fullmatch, fields)) and split_header(name)[1] in (None, "s"):
+            found[place] = fields[0]
+    return found
+
+
 def _is_units(rows: Sequence[tuple[int, list[str]]]) -> bool:
     """Return whether the line below the names contains units: words, followed by a line with numbers."""
     if len(rows) < 3 or len(rows[1][1]) > len(rows[0][1]):
@@ -219,14 +241,15 @@ def _read_columns(layout: Layout, names: Sequence[str]) -> Found:
         for frame in _chunks(layout, places):
             if frame[width].notna().any():
                 raise ValueError("a line has too many fields")
-            parts.append(frame[places].to_numpy().T)
+            parts.append(_numbers(layout, frame[places]).T)
     except ValueError as error:  # some field is no number, or a quotation mark is never closed
         _refuse(layout, places, str(error))
     values = np.concatenate(parts, axis=1)
     parts.clear()
     missing = np.isnan(values)
     doubtful = set(np.flatnonzero(missing.all(axis=0)).tolist())
-    last, notes = values.shape[1] - 1, []
+    last = values.shape[1] - 1
+    notes = [f"Times are in seconds after {layout.origins[place]}." for place in places if place in layout.origins]
     if missing[:, last:].any():
         doubtful.add(last)
     empty = []
@@ -242,6 +265,16 @@ def _read_columns(layout: Layout, names: Sequence[str]) -> Found:
     if not len(lines):
         raise layout.error(layout.header + 1, NO_DATA)
     return Found(dict(zip(names, values, strict=True)), Rows(os.fspath(layout.path), lines), tuple(notes))
+
+
+def _numbers(layout: Layout, frame: "DataFrame") -> Array:
+    """Return columns as numbers, shape (rows, columns); dates become seconds after the first of the file."""
+    import pandas as pd
+
+    for place in set(frame).intersection(layout.origins):
+        dates = pd.to_datetime(frame[place], format="ISO8601", utc=True)
+        frame[place] = (dates - pd.to_datetime(layout.origins[place], utc=True)) / pd.Timedelta("1s")
+    return frame.to_numpy(float)
 
 
 def _lines(layout: Layout, rows: set[int]) -> Iterator[tuple[int, str]]:
@@ -278,7 +311,8 @@ def _chunks(layout: Layout, places: Sequence[int]) -> Iterator["DataFrame"]:
     options: Any = {"header": 0, "names": range(width + 1), "usecols": [*places, width], "index_col": False}
     options |= {"sep": r"\s+" if layout.separator == " " else layout.separator, "decimal": layout.decimal}
     options |= {"na_values": list(MISSING), "keep_default_na": False, "skip_blank_lines": False}
-    options |= {"skipinitialspace": True, "dtype": float, "chunksize": CHUNK, "engine": "c"}
+    types = {place: str if place in layout.origins else float for place in options["usecols"]}
+    options |= {"skipinitialspace": True, "dtype": types, "chunksize": CHUNK, "engine": "c"}
     with layout.opened() as text:
         widened: Any = _Widened(text, layout)
         yield from pd.read_csv(widened, **options)
@@ -297,16 +331,29 @@ def _refuse(layout: Layout, places: Sequence[int], error: str) -> NoReturn:
                 commas = "; numbers with decimal commas need another separator, such as the semicolon"
                 raise layout.error(line, there + commas * (layout.separator == ","))
             for place, field in enumerate(_split(written, layout.separator)):
-                if place in places and field not in MISSING and not number.fullmatch(field):
-                    found = f"column {layout.columns[place]!r} holds {quoted(field)}"
+                if place not in places or field in MISSING:
+                    continue
+                found = f"column {layout.columns[place]!r} holds {quoted(field)}"
+                if place in layout.origins:
+                    if not _is_date(field):
+                        there = layout.origins[place]
+                        raise layout.error(line, f"{found}, which is not a date and a time of day like {there}")
+                elif not number.fullmatch(field):
                     raise layout.error(line, f"{found}, which is {_instead_of_number(field, layout.decimal)}")
     raise layout.error(layout.first, "the columns cannot be read as numbers; write them with one decimal sign")
+
+
+def _is_date(text: str) -> bool:
+    """Return whether a text is a date of the calendar with a time of day."""
+    with suppress(ValueError):
+        return INSTANT.fullmatch(text) is not None and datetime.fromisoformat(text) is not None
+    return False
 
 
 def _instead_of_number(text: str, decimal: str) -> str:
     """Describe the text found in place of a number, with a remedy."""
     if DATE.search(text):
-        return "a date or a time of day; write times as numbers, such as seconds since the first sample"
+        return "a date or a time of day; write times as 2024-03-01T12:30:00.5, or as seconds since the first sample"
     if text.startswith(COMMENTS):
         return "a comment; move comments above the names of the columns, or delete them"
     other, name = (",", "comma") if decimal == "." else (".", "point")

@@ -39,6 +39,10 @@ READ = {
     "names in a comment": ("# pump 3\n# t u y\n0 1 0.25\n0.5 -1.5 nan\n1 2 3\n", ()),
     "separators at the ends": ("t,u,y,\n0,1,0.25,,\n0.5,-1.5,,,\n1,2,3,\n", ()),
     "blank lines": ("t,u,y\n0,1,0.25\n\n0.5,-1.5,NA\n,,\n1,2,3\n\n", ()),
+    "dates": (
+        "Timestamp,u,y\n2024-02-29T23:59:59.5Z,1,0.25\n2024-03-01 00:00Z,-1.5,\n2024-03-01T02:00:00.5+02:00,2,3\n",
+        ("Times are in seconds after 2024-02-29T23:59:59.5Z.",),
+    ),
     "last line cut": (
         POINTS.format(",") + "1.5,2",
         ("Line 5, the last, breaks off before its last field; it was left out.",),
@@ -65,7 +69,9 @@ STRICTLY = "on line 3; times must increase strictly"
 INSTANT = "every sample needs its instant"
 NO_TEXT = "this is not a text file in UTF-8, or in UTF-16 with a byte order mark"
 KINDS = "records are read from text (.csv, .txt), MATLAB files (.mat) and HDF5 files (.h5)"
-DATE = "which is a date or a time of day; write times as numbers, such as seconds since the first sample"
+DATE = "which is a date or a time of day; write times as 2024-03-01T12:30:00.5, or as seconds since the first sample"
+DAY = "2023-02-2"
+NO_DAY = f"column 't' holds '{DAY}9T12:00', which is not a date and a time of day like {DAY}8T12:00"
 MARKS = "which is a number with separators between its digits; write it with digits and one decimal sign"
 NUMBER = "which is not a number; leave the field empty if the sample is missing"
 NO_NAMES = ":1: the first line names no columns; it must name them, for example t,u,y"
@@ -86,7 +92,8 @@ REFUSED = {
     "decimal commas between commas": ("t,u,y\n0,0,1,5,2,5\n0,5,1,5,2,5\n", f":2: {SIX}{COMMAS_TWICE}"),
     "too many fields": ("t;u;y\n0;1;2\n1;1;2;7\n", ":3: the line has 4 fields where line 1 names 3"),
     "comment between": ("t,u,y\n0,1,2\n# pause\n1,1,2\n", f":3: column 't' holds '# pause', {COMMENT}"),
-    "dates": ("t,u,y\n2024-03-01T12:00:00,1,2\n", f":2: column 't' holds '2024-03-01T12:00:00', {DATE}"),
+    "dates": ("t,u,y\n1.3.2024 12:00:00,1,2\n", f":2: column 't' holds '1.3.2024 12:00:00', {DATE}"),
+    "date that does not exist": (f"t,u,y\n{DAY}8T12:00,1,2\n{DAY}9T12:00,1,2\n", f":3: {NO_DAY}"),
     "open quotation mark": ('t,u,y\n0,1,"2\n1,1,2\n', f":2: {QUOTE}"),
     "time missing": ("t,u,y\n0,1,2\n,1,2\n", f":3: time 't' is missing or not finite; {INSTANT} [s]"),
     "time repeated": ("t [ms],u,y\n0,1,2\n5,1,2\n5,1,2\n", f":4: time 't [ms]' repeats 5 ms after 5 ms {STRICTLY}"),
