@@ -37,7 +37,7 @@ from .estimators.additive_output_error import AdditiveOutputError as AdditiveOut
 from .estimators.additive_srivc import AdditiveSrivc as AdditiveSrivc
 from .estimators.loop_output_error import LoopOutputError as LoopOutputError
 from .estimators.measured_submodels import MeasuredSubmodels as MeasuredSubmodels
-from .estimators.frequency_domain import FrequencyDomain as FrequencyDomain
+from .estimators.frequency_domain import FrequencyDomain as FrequencyDomain, FrequencyDomainSum as FrequencyDomainSum
 from .estimation.common import Bound as Bound, Fixed as Fixed
 from .estimators.identification import Identification as Identification
 from .identification.choice import Choice as Choice, Given as Given
@@ -56,6 +56,7 @@ from .estimators.measured_fit import MeasuredFit as MeasuredFit, MultiInputFit a
 from .estimators.loop_output_error import LoopFit as LoopFit
 from .estimators.measured_submodels import SubmodelsFit as SubmodelsFit
 from .estimators.frequency_domain import FrequencyDomainFit as FrequencyDomainFit
+from .estimators.frequency_domain import FrequencyDomainSumFit as FrequencyDomainSumFit
 from .estimators.useful_redundancy import RedundantFit as RedundantFit
 from .inference.criteria import fit_percent as fit_percent
 from .inference.frequency_response import FrequencyResponse as FrequencyResponse

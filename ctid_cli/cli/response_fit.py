@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.cli._options import RecordOptions, given_options, refuse_options
-from ctid_cli.cli.fit_structure import ModelRequest, as_usage_errors
+from ctid_cli.cli.fit_structure import FRACTION, SUM, ModelRequest, as_usage_errors
 from ctid_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -19,8 +19,6 @@ AT_REST = "its system is at rest"
 IN_LOOP = "a response that was measured in a loop is taken as it is"
 COLUMNS = "its columns are found by their names"
 OF_RECORDS = {
-    "--model": "a sum is the transfer function with all its poles; give --poles and --zeros",
-    "--terms": "give --poles and --zeros",
     "--initial-state": AT_REST,
     "--input-before": AT_REST,
     "--offset": "an offset is a line at frequency 0; leave that line out",
@@ -57,7 +55,7 @@ def frequency_fit(
     files: Sequence[Path], request: ModelRequest, columns: RecordOptions, assessment: object
 ) -> FrequencyFitResult:
     """Fit a model to the given frequency response; a UsageError for options that do not apply to one."""
-    from ctid_cli.estimators.frequency_domain import FrequencyDomain
+    from ctid_cli.estimators.frequency_domain import FrequencyDomain, FrequencyDomainSum
     from ctid_cli.identification.identify_response import identify_frequency_response
     from ctid_cli.reporting.frequency_fit import FrequencyFitResult
     from ctid_cli.signals.frequency_data import read_frequency_data
@@ -66,10 +64,13 @@ def frequency_fit(
         raise UsageError(f"{len(files)} files are given, and a frequency response is fitted by itself; give one file")
     given = given_options(request.options, request.loop, columns, assessment)
     refuse_options(given, OF_RECORDS, f"a frequency response ({files[0]})")
+    kind = "a sum of submodels" if request.is_sum else "one transfer function"
+    refuse_options(given, SUM if request.is_sum else FRACTION, kind)
     options = request.options.with_delays()
     poles, zeros, integrators = (options.common(name) for name in ("poles", "zeros", "integrators"))
-    if poles is None:
-        raise UsageError("--poles is missing: for a frequency response it must be given")
+    if (options.terms if request.is_sum else poles) is None:
+        missing = "--terms" if request.is_sum else "--poles"
+        raise UsageError(f"{missing} is missing: for a frequency response it must be given")
     data = read_frequency_data(files[0], columns.start, columns.stop)
     if options.weight is not None and data.standard_error is not None:
         raise UsageError(
@@ -78,6 +79,11 @@ def frequency_fit(
         )
     data = replace(data, weight=options.weight or "none")
     with as_usage_errors():
-        known: Any = {"integrators": integrators or 0, "fixed": options.fixed, "bounds": options.bounds}
-        estimator = FrequencyDomain(poles, zeros or 0, options.common("delay_bounds") or (0.0, 0.0), **known)
+        delays: Any = options.common("delay_bounds") or (0.0, 0.0)
+        estimator: FrequencyDomain | FrequencyDomainSum
+        if request.is_sum:
+            estimator = FrequencyDomainSum(options.submodels, delays, fixed=options.fixed)
+        else:
+            known: Any = {"integrators": integrators or 0, "fixed": options.fixed, "bounds": options.bounds}
+            estimator = FrequencyDomain(poles, zeros or 0, delays, **known)
         return FrequencyFitResult.of(identify_frequency_response(data, estimator))

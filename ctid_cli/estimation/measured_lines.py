@@ -7,9 +7,8 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
-from ctid_cli.estimation.parameter_layout import Degrees, Layout
+from ctid_cli.estimation.parameter_layout import Degrees, Layout, SumDegrees
 from ctid_cli.filtering.frequency_lines import FrequencyLines
-from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.signals.frequency_data import FrequencyData
 
 
@@ -22,18 +21,19 @@ class MeasuredLines(MeasuredRecords):
     def __init__(
         self,
         source: FrequencyData,
-        structure: Structure,
+        degrees: Degrees | SumDegrees,
         delay_bounds: tuple[float, float],
-        integrators: int = 0,
         known: KnownCoefficients = NOTHING,
     ) -> None:
         self.source, self.known = source, known
-        self.treatment = Treatment(delay_bounds, "rest", "none", "foh", integrators=(integrators,))
-        self.layout = Layout(Degrees.of(structure, integrators))
         self.records, self.input_offsets, self.offsets = [], [0.0], [0.0]
         self.lines = lines_of(source)
         self.outputs = [self.lines.y_used]
-        self.problem = Problem((self.lines,), structure.zeros, False, (), (0.0,), integrators=integrators)
+        arguments = dict(degrees.search_arguments)
+        self.problem = Problem((self.lines,), arguments.pop("zeros"), False, (), (0.0,), **arguments)
+        integrators = (sum(self.problem.each_integrators),)
+        self.treatment = Treatment(delay_bounds, "rest", "none", "foh", integrators=integrators)
+        self.layout = Layout(degrees)
 
     def check(self) -> None:
         """Raise DataError if the structure cannot be estimated from the data."""

@@ -13,14 +13,17 @@ from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Prepared, Start, places_of
 from ctid_cli.estimation.measured_lines import MeasuredLines
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
+from ctid_cli.estimation.parameter_layout import Degrees, SumDegrees
+from ctid_cli.estimators.additive_output_error import GROWN, AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.measured_fit import MeasuredFit, fitted, samples_at
+from ctid_cli.estimators.measured_submodels import SubmodelsFit
 from ctid_cli.inference.covariance import robust_covariance, sandwich, unit_inverse
 from ctid_cli.inference.residual_tests import all_white, chi_square_tail, normal_tail
-from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.inference.sensitivities import Structure, SumStructure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty
+from ctid_cli.models.additive import AdditiveModel, names_of
 from ctid_cli.signals.frequency_data import FrequencyData
 from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offset, OutputHold
 
@@ -143,16 +146,35 @@ class FrequencyDomainFit(MeasuredFit):
         count = frequencies.size
         ones = FrequencyData(frequencies, np.ones(count, dtype=complex), interval=self.data.interval)
         measured, parts = _laid_out(self, ones), np.zeros(2 * count)
-        parts[measured.lines.use] = measured.outputs[0] - measured.errors_of(self.model).residuals[0]
+        parts[measured.lines.use] = measured.outputs[0] - measured.errors_of(self.parametrised).residuals[0]
         return np.asarray(parts[:count] + 1j * parts[count:])
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrequencyDomainSumFit(FrequencyDomainFit, SubmodelsFit):
+    """Fit of a sum of submodels to a measured frequency response.
+
+    Parameters
+    ----------
+    model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number, data
+        As in :class:`FrequencyDomainFit`; ``model`` is the sum as one transfer function.
+    history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
+        As in :class:`FrequencyDomainFit`.
+    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
+        As in :class:`FrequencyDomainFit`.
+    additive, start_method, loop_radius, in_loop, consistency, sampling, two_stage
+        As in :class:`~ctid_cli.estimators.measured_submodels.SubmodelsFit`; only the first two apply.
+    """
 
 
 def _laid_out(fit: FrequencyDomainFit, data: FrequencyData) -> MeasuredLines:
     """Return the lines prepared for the structure of a fit."""
+    free, bounds = "delay" in fit.parameter_names, (fit.model.delay,) * 2
+    if isinstance(fit, SubmodelsFit) and fit.additive is not None:
+        return MeasuredLines(data, SumDegrees(SumStructure(fit.additive.terms, free)), bounds)
     integrators = int(np.count_nonzero(np.cumsum(fit.model.denominator[::-1]) == 0.0))
     zeros = sum(name.startswith("b") for name in fit.parameter_names) - 1
-    structure = Structure(fit.model.order, zeros, "delay" in fit.parameter_names)
-    return MeasuredLines(data, structure, (fit.model.delay,) * 2, integrators)
+    return MeasuredLines(data, Degrees.of(Structure(fit.model.order, zeros, free), integrators), bounds)
 
 
 @dataclass(frozen=True)
@@ -214,25 +236,84 @@ class FrequencyDomain(DelayProfile):
         low, high = self.delay_bounds
         known = places_of(self.fixed, Structure(self.poles, self.zeros).names)
         coefficients = KnownCoefficients.of(self.poles, self.zeros, known) if known else NOTHING
-        structure = Structure(self.order, self.zeros, delay=low < high)
-        measured = MeasuredLines(record, structure, self.delay_bounds, self.integrators, coefficients)
+        degrees = Degrees.of(Structure(self.order, self.zeros, delay=low < high), self.integrators)
+        measured = MeasuredLines(record, degrees, self.delay_bounds, coefficients)
         measured.check()
         return Prepared(self, measured)
 
     def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
-        if not isinstance(measured, MeasuredLines):
-            raise DataError("this fit takes a frequency response (FrequencyData); DelayProfile takes records in time")
-        if self.bounds:
-            return with_data(self._within_bounds(measured), measured)
-        return fit_of(measured, measured.best([], True))
+        own = _lines(measured)
+        found = self._within_bounds(own) if self.bounds else fitted(own, own.best([], True), None, None)
+        return FrequencyDomainFit(**_values(found), data=own.source)._with_uncertainty("auto", DRAWS)
 
 
-def fit_of(measured: MeasuredLines, optimum: Optimum) -> FrequencyDomainFit:
-    """Return the fit of an optimum with its standard errors."""
-    return with_data(fitted(measured, optimum, None, None), measured)
+@dataclass(frozen=True)
+class FrequencyDomainSum(AdditiveOutputError):  # noqa: N818 - not an exception
+    """Least squares over frequency for a sum of submodels.
+
+    Parameters
+    ----------
+    terms, delay_bounds, fixed
+        As in :class:`~ctid_cli.estimators.additive_output_error.AdditiveOutputError`.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+
+    Notes
+    -----
+    Cost, admissible poles and standard errors are those of :class:`FrequencyDomain`; the search is that of
+    :class:`~ctid_cli.estimators.additive_output_error.AdditiveOutputError`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli import FrequencyData, Term
+    >>> s = 1j * np.geomspace(0.1, 10.0, 50)
+    >>> values = 2.0 / (s**2 + 0.2 * s + 1.0) + 1.0 / (0.1 * s**2 + 0.1 * s + 1.0)
+    >>> fit = FrequencyDomainSum((Term(2, 0), Term(2, 0))).fit(FrequencyData(s.imag, values))
+    >>> {name: round(value, 6) for name, value in fit.parameters.items() if name.startswith("g2")}
+    {'g2_a1': 0.1, 'g2_a2': 0.1, 'g2_b0': 1.0}
+    """
+
+    # Options of records in time, with their defaults: a frequency response has none of them.
+    initial_state: InitialState = field(init=False, default="rest")
+    offset: Offset = field(init=False, default="none")
+    loss: LossKind = field(init=False, default="squares")
+    covariance: Covariance = field(init=False, default="auto")
+    bootstrap_draws: int = field(init=False, default=DRAWS)
+    input_before: InputBefore = field(init=False, default=None)
+    noise_model: str = field(init=False, default="white")
+
+    def prepare(self, record: Any) -> Prepared[MeasuredRecords, MeasuredFit]:
+        """Check and prepare a frequency response; a record is prepared for applying a model to it."""
+        if not isinstance(record, FrequencyData):
+            return super().prepare(record)
+        low, high = self.delay_bounds
+        known = places_of(self.fixed, names_of(self.terms))
+        coefficients = KnownCoefficients.of_sum(self.terms, known) if known else NOTHING
+        degrees = SumDegrees(SumStructure(self.terms, delay=low < high))
+        measured = MeasuredLines(record, degrees, self.delay_bounds, coefficients)
+        measured.check()
+        return Prepared(self, measured)
+
+    def _estimate(self, measured: MeasuredRecords, start: Start | None) -> SubmodelsFit:
+        own = _lines(measured)
+        found = fitted(own, own.best([], True), None, None)
+        size = sum(term.size for term in self.terms)
+        additive = AdditiveModel.from_theta(found.theta[:size], self.terms, found.model.delay)
+        fit = FrequencyDomainSumFit(**_values(found), data=own.source, additive=additive, start_method=GROWN)
+        return fit._with_uncertainty("auto", DRAWS)
 
 
-def with_data(found: MeasuredFit, measured: MeasuredLines) -> FrequencyDomainFit:
-    """Return a fit with its frequency response and standard errors."""
-    values = {each.name: getattr(found, each.name) for each in fields(found)}
-    return FrequencyDomainFit(**values, data=measured.source)._with_uncertainty("auto", DRAWS)
+def _lines(measured: MeasuredRecords) -> MeasuredLines:
+    """Return a prepared frequency response; raise a DataError for a record."""
+    if not isinstance(measured, MeasuredLines):
+        raise DataError("this fit takes a frequency response (FrequencyData); DelayProfile takes records in time")
+    return measured
+
+
+def _values(fit: MeasuredFit) -> dict[str, Any]:
+    """Return the fields of a fit."""
+    return {each.name: getattr(fit, each.name) for each in fields(fit)}

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ctid_cli.estimators.frequency_domain import MISFIT, FrequencyDomain, FrequencyDomainFit
+from ctid_cli.estimators.frequency_domain import MISFIT, FrequencyDomain, FrequencyDomainFit, FrequencyDomainSum
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.reported_parameters import free_directions, reported_parameters
 from ctid_cli.identification.fit_warnings import LOW_FIT, MOST, of_conditioning, of_lost_poles, of_search
@@ -17,15 +17,15 @@ from ctid_cli.signals.frequency_data import FrequencyData
 from ctid_cli.text import count, probability
 
 
-def identify_frequency_response(data: FrequencyData, options: FrequencyDomain) -> Identification:
+def identify_frequency_response(data: FrequencyData, options: FrequencyDomain | FrequencyDomainSum) -> Identification:
     """Fit a model to a frequency response and assess it.
 
     Parameters
     ----------
     data : FrequencyData
         The frequency response.
-    options : FrequencyDomain
-        Structure of the model, and the weights of lines without standard errors.
+    options : FrequencyDomain or FrequencyDomainSum
+        Structure of the model.
 
     Returns
     -------
@@ -79,11 +79,11 @@ def _response_test(fit: FrequencyDomainFit) -> ResponseTest:
     return ResponseTest(fit.r2, least / (1.0 + least), p_value)
 
 
-def _of_delay(fit: FrequencyDomainFit, options: FrequencyDomain) -> Iterator[str]:
+def _of_delay(fit: FrequencyDomainFit, options: FrequencyDomain | FrequencyDomainSum) -> Iterator[str]:
     """Yield that a delay is missing, if the model misses lines that a delay fits."""
     known, most = options.delay_bounds
     missed = fit.misfit_p_value < MISFIT or not fit.white or fit.fit_percent < LOW_FIT
-    if not missed or known < most or options.zeros >= options.poles + options.integrators:
+    if not missed or known < most or options.zeros >= options.order:
         return
     # A longer delay would turn the phase of all lines by more than a quarter turn.
     reach = float(f"{known + 0.5 * np.pi / fit.data.frequencies[fit.data.frequencies > 0.0].min():.2g}")

@@ -140,10 +140,10 @@ def _notes(used: list[int], base: float, chosen: bool, unresolved: Array, time_u
     if not used:
         return ()
     span = f"{2 * used[0] + 1}" if len(used) == 1 else f"{2 * used[0] + 1} to {2 * used[-1] + 1}"
-    how = "half of the largest number that fits as well as the smallest" if chosen else "as given"
+    how = ", half of the widest that fits as well as the narrowest" if chosen else ", as given"
     text = (
-        f"Each estimate is from {span} lines, {base:.4g} rad/{time_unit} apart, {how}; estimates closer than that "
-        "share data."
+        f"Each estimate is from a window of {span} lines, {base:.4g} rad/{time_unit} apart{how}. Estimates whose "
+        "windows overlap share data."
     )
     if not unresolved.size:
         return (text,)
@@ -431,8 +431,9 @@ def welch(u: Array, y: Array, interval: float, length: int | None, time_unit: st
     variance = (1.0 - coherence) * yy / uu / (count - 1.0)
     note = (
         f"Averages over {segments} segments of {size} samples under Hann windows with half "
-        f"overlap. No intervals: peaks narrower than {8 * np.pi / (size * interval):.3g} rad/{time_unit} are flattened "
-        "and leakage remains, neither visible in their scatter; --method local-polynomial gives intervals."
+        "overlap. There are no intervals, as the scatter of the averages shows neither leakage nor the flattening of "
+        f"peaks narrower than {8 * np.pi / (size * interval):.3g} rad/{time_unit}; --method local-polynomial gives "
+        "intervals."
     )
     frequencies: Array = 2 * np.pi / (size * interval) * np.flatnonzero(kept).astype(np.float64)
     freedom = np.full(frequencies.size, count - 1.0)

@@ -173,7 +173,8 @@ class FitResult(PagedResult):
 
     def parameters(self) -> Section:
         """Return the parameters with their uncertainty."""
-        return Section.table(parameters_of(self.fitted, self.units), PARAMETER, notes=[_covariance_line(self.fitted)])
+        notes = [f"{self.fitted.errors_sentence} {form_of(self.fitted.fit)}"]
+        return Section.table(parameters_of(self.fitted, self.units), PARAMETER, notes=notes)
 
     def derived(self) -> Section:
         """Return derived quantities as a table, and why some have no error."""
@@ -378,12 +379,11 @@ def _offset(result: Identification, units: Units) -> str:
     return f"{TREATMENTS['remove']}: {'; '.join(means)}"
 
 
-def _covariance_line(result: Identification) -> str:
-    """Return the assumptions of the standard errors, and how coefficients are scaled and numbered."""
-    form = "Monic denominator, descending powers."
-    if additive_of(result.fit) is not None:
-        form = "g1_a2 multiplies p^2 in the denominator of the first submodel, whose constant term is 1."
-    return f"{result.errors_sentence} {form}"
+def form_of(fit: MeasuredFit) -> str:
+    """Return how coefficients are scaled and numbered."""
+    if additive_of(fit) is not None:
+        return "g1_a2 multiplies p^2 in the denominator of the first submodel, whose constant term is 1."
+    return "Monic denominator, descending powers."
 
 
 def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record], units: Units) -> str:

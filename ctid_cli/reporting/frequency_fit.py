@@ -18,7 +18,7 @@ from ctid_cli.reporting.estimate import PARAMETER
 from ctid_cli.reporting.figures.style import BAND, DARK, MIDDLE, Drawing, name_axes
 from ctid_cli.reporting.figures.style import plain as plain_text
 from ctid_cli.reporting.fit_content import fit_content, parameters_of
-from ctid_cli.reporting.fit_result import FitResult
+from ctid_cli.reporting.fit_result import FitResult, form_of
 from ctid_cli.reporting.frf_plot import decibels, name_response
 from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.model_plot import bode_drawing, poles_chapter, step_drawing
@@ -84,7 +84,7 @@ class FrequencyFitResult(FitResult):
 
     def parameters(self) -> Section:
         """Return the parameters with their uncertainty."""
-        notes = [f"{self._errors()} Monic denominator, descending powers."]
+        notes = [f"{self._errors()} {form_of(self.fit)}"]
         return Section.table(parameters_of(self.fitted, self.units), PARAMETER, notes=notes)
 
     def _errors(self) -> str:

@@ -36,6 +36,18 @@ def test_a_frequency_response_is_fitted_drawn_and_reported(ctid, tmp_path, snaps
     assert pages[0] == pages[1]
 
 
+def test_a_sum_of_one_submodel_is_the_transfer_function(ctid, tmp_path):
+    file, found = response_file(tmp_path), []
+    for options in ("--poles 1", "--model additive --terms 1/0 --report"):
+        out = tmp_path / str(len(found))
+        found.append(json.loads(ctid(f"fit {options} --delay 0:2 --json --out", out, file).stdout))
+    fraction, one_submodel = found
+    assert one_submodel["fit_percent"] == pytest.approx(fraction["fit_percent"], rel=1e-9)
+    assert one_submodel["model"]["submodels"][0]["numerator"] == pytest.approx([2.0], rel=0.01)
+    again = ctid("report --file", tmp_path / "again.html", tmp_path / "1" / "fit.json")
+    assert (tmp_path / "again.html").read_text() == (tmp_path / "1" / "fit.html").read_text(), again.stderr
+
+
 def test_a_delay_that_is_missing_is_named(ctid, tmp_path):
     response_file(tmp_path)
     found = ctid("fit --poles 1 --json --out", tmp_path / "new", tmp_path / "frf.csv").stdout

@@ -4,12 +4,16 @@ import numpy as np
 import pytest
 
 from ctid_cli import (
+    AdditiveModel,
     DataError,
     Fixed,
     FrequencyData,
     FrequencyDomain,
+    FrequencyDomainSum,
     HeldSignal,
     Record,
+    Submodel,
+    Term,
     TransferFunction,
     estimate_frequency_response,
     identify_frequency_response,
@@ -19,7 +23,9 @@ from ctid_cli.estimation.measured_lines import MeasuredLines
 from ctid_cli.estimation.optimum.box import box_of, point_of
 from ctid_cli.estimation.optimum.projection import project, slopes
 from ctid_cli.estimation.optimum.triangle import Delay
+from ctid_cli.estimation.parameter_layout import Degrees
 from ctid_cli.inference.sensitivities import Parametric, Structure
+from ctid_cli.models.factoring import unfactored
 
 SECOND = TransferFunction([2.0, 4.0], [1.0, 1.0, 4.0])
 LINES = np.geomspace(0.1, 20.0, 120)
@@ -71,7 +77,7 @@ def test_lines_of_samples_give_the_coefficients_that_made_them(model, interval, 
 @pytest.mark.parametrize("poles", [[-1.0 + 2j, -1.0 - 2j, -3.0], [-1.0, -1.0, -3.0]], ids=["fractions", "states"])
 def test_gradient_is_that_of_differences(interval, poles):
     data = FrequencyData(np.linspace(0.0, 12.0, 40), 1.0 / (1j * np.linspace(0.0, 12.0, 40) + 0.5), interval=interval)
-    measured = MeasuredLines(data, Structure(3, 1, delay=True), (0.0, 2.0))
+    measured = MeasuredLines(data, Degrees.of(Structure(3, 1, delay=True)), (0.0, 2.0))
     problem, box = measured.problem, box_of(measured.problem, (0.0, 2.0))
     point = point_of(np.array(poles, dtype=complex), 0.33, box)
 
@@ -113,6 +119,29 @@ def test_lines_with_common_errors_have_the_standard_errors_of_correlated_noise()
     fit = FrequencyDomain(2, 1).fit(FrequencyData(w, values))
     assert fit.law.kind == "robust"
     assert fit.standard_errors["b1"] > 1.5 * np.sqrt(fit.uncertainty("white").covariance[3, 3])
+
+
+def test_a_sum_of_one_mode_is_the_transfer_function():
+    data = noisy(TransferFunction([2.0, 4.0], [1.0, 1.0, 4.0], 0.7), 3)
+    fraction = identify_frequency_response(data, FrequencyDomain(2, 1, (0.0, 2.0)))
+    one_mode = identify_frequency_response(data, FrequencyDomainSum((Term(2, 1),), (0.0, 2.0)))
+    np.testing.assert_allclose(one_mode.fit.model.denominator, fraction.fit.model.denominator, rtol=1e-6)
+    np.testing.assert_allclose(one_mode.fit.model.numerator, fraction.fit.model.numerator, rtol=1e-6)
+    np.testing.assert_allclose(one_mode.fit.responses_at(LINES), fraction.fit.responses_at(LINES), rtol=1e-6)
+    assert one_mode.fit.cost == pytest.approx(fraction.fit.cost, rel=1e-9)
+    bands = [each.frequency_response(LINES).gain_error for each in (fraction, one_mode)]
+    np.testing.assert_allclose(*bands, rtol=1e-4)
+
+
+@pytest.mark.parametrize("interval", [0.0, 0.1])
+def test_lines_give_the_submodels_that_made_them(interval):
+    integrating = Submodel([2.0], [1.0, 0.3], integrators=1)
+    truth = AdditiveModel([integrating, Submodel([1.0], [1.0, 0.2, 4.0]), Submodel([9.0], [1.0, 0.4, 25.0])], 0.23)
+    whole = unfactored(truth)
+    data = sampled(whole, interval) if interval else FrequencyData(LINES, whole.frequency_response(LINES))
+    fit = FrequencyDomainSum(truth.terms, (0.0, 1.0), fixed=(Fixed("g2_a1", float(truth.theta[2])),)).fit(data)
+    np.testing.assert_allclose(fit.additive.theta, truth.theta, rtol=1e-8)
+    assert fit.model.delay == pytest.approx(0.23, abs=1e-8)
 
 
 def test_a_line_that_was_measured_twice_counts_twice():

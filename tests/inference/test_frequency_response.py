@@ -153,7 +153,7 @@ def test_welch_averages():
     assert np.median((np.abs(found.response - true) / np.abs(true))[low]) < 0.05
     assert found.coherence[found.frequencies < 3].min() > 0.95
     assert not found.has_interval.any()
-    assert any("No intervals" in note for note in found.notes)
+    assert any("no intervals" in note for note in found.notes)
 
 
 def test_the_period_of_an_input():

@@ -328,7 +328,8 @@ def _with_constant_one(a: Array, slopes: Array) -> Array:
 def box_of(problem: Problem, delays: Bounds) -> Box:
     """Return the admissible set for records, or for a frequency response."""
     if problem.lines is not None:
-        return _box_of_lines(problem.lines, each_bounds(delays)[0])
+        box = _box_of_lines(problem.lines, each_bounds(delays)[0])
+        return replace(box, parts=problem.parts, monic=problem.monic)
     length, interval, rate, cells = 0.0, np.inf, 0.0, set()
     for data in problem.sampled:
         used, steps = data.t[data.use], np.diff(data.t)
