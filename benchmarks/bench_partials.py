@@ -1,6 +1,6 @@
 """Partials of recorded notes: those of an independent fit, and the number of them in a track.
 
-    python benchmarks/bench_partials.py guitar_E2.csv [more.csv] [--windows 4] [--again] [--made]
+    python benchmarks/bench_partials.py guitar_E2.csv [more.csv] [--windows 4] [--again] [--made] [--peaks]
 
 In windows of one second, exponentially growing chirps are fitted by Gauss-Newton steps with dense linear algebra.
 Peaks of the residual are added if they are 10 dB above the noise floor, a running median. A partial that is 10 dB above
@@ -10,11 +10,16 @@ to two minutes.
 
 The fit itself is uncertain: ``--again`` counts the partials that it finds again in a window that begins 2 ms later, and
 ``--made`` those that it finds in white noise, and in twelve harmonics that decay in two stages, each of one frequency.
+
+``--peaks`` compares with the peaks of a periodogram instead: its window has side lobes of -92 dB, and separates lines
+that are 4 Hz apart.
 """
 
 import argparse
 
 import numpy as np
+from scipy.ndimage import median_filter
+from scipy.signal import find_peaks, get_window
 
 from ctid_cli.signals.sampled_signal import read_sampled_signal
 from ctid_cli.tones.track import track
@@ -29,6 +34,8 @@ EVERY = 0.005
 #: Shift of the windows of ``--again`` [s], and number, fundamental [Hz] and rate of the harmonics of ``--made``.
 SHIFT = 0.002
 HARMONICS, FUNDAMENTAL, RATE = 12, 147.0, 8000
+#: Levels that ``--peaks`` counts [dB], least prominence of a peak [dB], and bins of the running median.
+LEVELS, PROMINENCE, PEAK_FLOOR = (30.0, 20.0, 10.0), 6.0, 101
 
 
 def model(u, parameters):
@@ -166,17 +173,43 @@ def compare(file, windows, again):
             print(f"  {start}, {name:11}: {which.sum():3} partials, {kept}, {valid}; {lost}", flush=True)
 
 
+def compare_peaks(file, windows):
+    """Print the peaks of periodograms of one second, and those within .3 and 1 Hz of a row of the track there."""
+    record = read_sampled_signal(file).in_seconds()
+    found = track(record)
+    hertz, size = found.omega / (2.0 * np.pi), round(1.0 / record.interval)
+    counts = np.zeros((len(LEVELS), 3), int)
+    for begin in np.linspace(0, record.samples.size - size, windows).astype(int):
+        y = record.samples[begin : begin + size]
+        power = np.abs(np.fft.rfft((y - y.mean()) * get_window("blackmanharris", size), PADDING * size)) ** 2
+        decibels = 10.0 * np.log10(power * np.log(2.0) / median_filter(power, PADDING * PEAK_FLOOR))
+        places, _ = find_peaks(decibels, height=LEVELS[-1], prominence=PROMINENCE)
+        begins = begin * record.interval
+        there = hertz[(found.t >= begins) & (found.t <= begins + 1.0)]
+        off = np.nanmin(np.abs(there[:, :, None] - places / (PADDING * size * record.interval)), axis=(0, 1))
+        level = np.argmax(decibels[places] >= np.array(LEVELS)[:, None], axis=0)
+        for k in range(len(LEVELS)):
+            here = off[level == k]
+            counts[k] += [here.size, (here < KEPT_HZ).sum(), (here < 1.0).sum()]
+    for low, (all_, kept, near) in zip(LEVELS, counts, strict=True):
+        print(f"{file}, from {low:g} dB: {all_} peaks, {kept} with a row within {KEPT_HZ} Hz, {near} within 1 Hz")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", nargs="*")
     parser.add_argument("--windows", type=int, default=4)
     parser.add_argument("--again", action="store_true", help="count the partials that a shifted window has too")
     parser.add_argument("--made", action="store_true", help="count the partials of made records")
+    parser.add_argument("--peaks", action="store_true", help="compare with the peaks of a periodogram")
     given = parser.parse_args()
     if given.made:
         made_records(2)
     for file in given.files:
-        compare(file, given.windows, given.again)
+        if given.peaks:
+            compare_peaks(file, given.windows)
+        else:
+            compare(file, given.windows, given.again)
 
 
 if __name__ == "__main__":

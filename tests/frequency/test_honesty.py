@@ -81,16 +81,6 @@ def test_an_estimate_that_converges_stays_valid(options):
     assert np.abs(track.frequencies[track.valid] - TRUTH).max() < 1e-3
 
 
-def test_five_tones_are_valid_only_once_they_are_known():
-    omega = np.array([1.0, 2.0, 3.0, 4.2, 5.5])
-    y = np.sin(np.outer(T, omega) + np.arange(5)).sum(axis=1)
-    track = RestartingLeastSquares(tones=5, h=0.4).track(y, INTERVAL)
-    error = np.abs(track.frequencies - omega).max(axis=1)
-    assert error[410] > 1e-3  # right after the delays are filled
-    assert error[track.valid].max() < 1e-4
-    assert track.valid[-2000:].all()
-
-
 @pytest.mark.parametrize("scale", [1e-25, 1e25])
 @pytest.mark.parametrize("options", ONLINE, ids=lambda options: options.kind)
 def test_extreme_amplitudes_give_no_wrong_number(options, scale):

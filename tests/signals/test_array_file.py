@@ -9,8 +9,6 @@ import scipy.io
 from scipy.io.matlab import MatlabObject
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals import array_file
-from ctid_cli.signals.frequency_data import is_frequency_table
 from ctid_cli.signals.measurement import read_measurement
 
 T = 0.1 * np.arange(5)
@@ -139,9 +137,7 @@ def test_the_line_is_given_where_the_arrays_beside_an_object_do_not_suffice(rig)
         ({"t": T, "u": U[:4], "y": Y}, {}, "'u' has 4 values and 'y' has 5; they must be equally many"),
         ({"t": T[:4], "u": U, "y": Y}, {}, "'t' has 4 values and 'y' has 5"),
         ({"t": T[::-1], "u": U, "y": Y}, {}, "sample 2: time 't' goes back to 0.3 s after 0.4 s on sample 1"),
-        ({"t": T, "u": U, "y": Y * np.nan}, {}, "sample 1: no sample of output 'y' is a finite number"),
         ({"t": T, "valve": U, "y": Y}, {}, "no variable is called 'u' or 'input'; the file has 't', 'valve', 'y'"),
-        ({"valve": U}, {"input": "valv"}, "there is no variable 'valv'; the file has 'valve'. Did you mean 'valve'?"),
         ({"Ts": -0.1, "u": U, "y": Y}, {}, "'Ts' is -0.1; a sampling interval must be a positive number"),
         ({}, {}, "the file holds no arrays; in MATLAB, save plain vectors"),
     ],
@@ -168,14 +164,3 @@ def test_a_cut_file_is_refused_or_incomplete_but_never_a_traceback(rig):
         rig.write_bytes(whole[:length])
         with pytest.raises(DataError, match=r"rig\.mat"):
             read_measurement(rig)
-
-
-def test_looking_at_the_names_first_reads_the_file_once(rig, monkeypatch):
-    scipy.io.savemat(rig, COLUMNS)
-    read, files = array_file._read_in_own_process, []
-    monkeypatch.setattr(array_file, "_read_in_own_process", lambda file: files.append(file) or read(file))
-    assert not is_frequency_table(rig)
-    read_measurement(rig)
-    assert files == [str(rig)]
-    scipy.io.savemat(rig, COLUMNS | {"y": 2 * Y, "x": 1.0})
-    assert read_measurement(rig).record.y[1] == 2 * Y[1]

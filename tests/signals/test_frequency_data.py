@@ -83,7 +83,3 @@ def test_what_is_refused_of_a_table(tmp_path, header, comment, message):
 def test_what_is_refused_of_arrays(values, message):
     with pytest.raises(DataError, match=message):
         FrequencyData(*values)
-
-
-def test_a_record_is_no_frequency_response(tmp_path):
-    assert not is_frequency_table(table(tmp_path, "t,u,y", W, W, W))

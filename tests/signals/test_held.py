@@ -8,17 +8,6 @@ from hypothesis import strategies as st
 from ctid_cli.errors import DataError
 from ctid_cli.signals.held import HeldSignal, regular_interval
 
-BREAKS = st.lists(st.integers(-1000, 1000), min_size=1, max_size=30, unique=True).map(
-    lambda ticks: 0.05 * np.sort(np.array(ticks, dtype=float))
-)
-
-
-@st.composite
-def signals(draw):
-    t = draw(BREAKS)
-    values = draw(st.lists(st.floats(-10, 10), min_size=t.size, max_size=t.size))
-    return HeldSignal(t, np.array(values), draw(st.sampled_from(["zoh", "foh"])))
-
 
 @pytest.mark.parametrize(
     ("hold", "values"),
@@ -27,14 +16,6 @@ def signals(draw):
 def test_values_between_the_breaks_before_and_after(hold, values):
     signal = HeldSignal([0.0, 1.0, 3.0], [2.0, 4.0, -1.0], hold)
     assert signal.at([-0.1, 0.0, 0.5, 1.0, 2.0, 3.0, 100.0]).tolist() == values
-
-
-@given(signals(), st.floats(-50, 50), st.floats(0, 50))
-def test_delay_shifts_the_signal(signal, time, delay):
-    later = HeldSignal(signal.t + delay, signal.values, signal.hold)
-    # Not near jumps, where rounding of time + delay may place an instant on either side.
-    if np.abs(signal.t - time).min() > 1e-6:
-        np.testing.assert_allclose(later.at(time + delay), signal.at(time), atol=1e-9)
 
 
 def test_an_edge_and_a_sample_of_one_name_are_one_instant():
@@ -52,11 +33,9 @@ def test_an_edge_and_a_sample_of_one_name_are_one_instant():
     [
         ([], [], "zoh", "one equal, non-zero length"),
         ([0.0, 1.0], [1.0], "zoh", "one equal, non-zero length"),
-        ([[0.0]], [[1.0]], "zoh", "one equal, non-zero length"),
         ([0.0, 1.0], [1.0, np.nan], "zoh", "not a finite number"),
         ([0.0, np.inf], [1.0, 2.0], "zoh", "missing or not finite"),
         ([0.0, 2.0, 1.0], [1.0, 2.0, 3.0], "zoh", "goes back to 1 s after 2 s on sample 2"),
-        ([0.0, 2.0, 2.0], [1.0, 2.0, 3.0], "zoh", "must increase strictly"),
         ([0.0, 1.0, 2.5], [1.0, 2.0, 3.0], "band-limited", "needs a regular clock"),
         ([0.0], [1.0], "cubic", "hold must be 'zoh', 'foh' or 'band-limited', not 'cubic'"),
     ],

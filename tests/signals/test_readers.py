@@ -182,9 +182,7 @@ def test_hdf5_has_a_data_set_for_each_column(tmp_path):
         read_measurement(path)
 
 
-def test_a_missing_file_and_an_unknown_hold(tmp_path):
+def test_a_missing_file(tmp_path):
     for name in ("absent.csv", "absent.mat", "absent.h5"):
         with pytest.raises(DataError, match="does not exist; relative names start at "):
             read_measurement(tmp_path / name)
-    with pytest.raises(ValueError, match="hold must be 'zoh' or 'foh' or 'band-limited', not 'cubic'"):
-        read_measurement(tmp_path / "absent.csv", hold="cubic")

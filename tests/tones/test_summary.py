@@ -3,13 +3,9 @@
 import numpy as np
 import pytest
 
-from ctid_cli.frequency.flags import Flag, flag_names
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.tones.summary import summarise
 from tests.tones.made_tracks import HERTZ, ROWS, coming_later, make_track, some_invalid
-
-
-def test_names_of_flags():
-    assert flag_names(np.array([int(Flag.STARTING | Flag.GAP), 0], np.uint16)).tolist() == ["starting gap", ""]
 
 
 def test_a_summary_is_over_valid_rows():

@@ -45,9 +45,3 @@ def test_far_from_the_rows_nothing_is_known():
     far = synthesised(track_of(ROWS[:20]), T)
     assert np.isfinite(far[: 1051 + 98]).all()
     assert np.isnan(far[1051 + 102 :]).all()
-
-
-def test_pieces_change_nothing(monkeypatch):
-    whole = synthesised(track_of(), T)
-    monkeypatch.setattr("ctid_cli.tones.constants.BLOCK_SAMPLES", 97)
-    assert synthesised(track_of(), T) == pytest.approx(whole, abs=1e-12, nan_ok=True)
