@@ -68,6 +68,17 @@ def add_row(row: Array, gram: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
+def symmetric(upper: Array, size: int) -> Array:
+    """Return the symmetric matrix whose upper triangle is given row by row."""
+    matrix, place = np.empty((size, size)), 0
+    for i in range(size):
+        for j in range(i, size):
+            matrix[i, j] = matrix[j, i] = upper[place]
+            place += 1
+    return matrix
+
+
+@njit(cache=True, nogil=True)
 def residual_of(row: Array, theta: Array) -> float:
     """Return the residual ``psi - phi' theta`` of a row ``[phi psi]``."""
     residual = row[theta.size]
@@ -305,7 +316,7 @@ class Checks(NamedTuple):
 def check_estimates(
     theta: Array, rows: Array, grams: Array, counts: Array, clock: Clock, checks: Checks, omega: Array, flags: Flags
 ) -> None:
-    """Decode estimates and flag unreliable ones by the moments of recent rows at both delays.
+    """Decode estimates and flag unreliable ones by the moments of recent rows at both delays, as upper triangles.
 
     ``counts`` contains, for each estimate, its number of recent rows (without any it is not checked), its number of
     samples, and the number of all samples so far; ``flags`` are the known flags, which are extended.
@@ -331,7 +342,7 @@ def check_estimates(
         # A contradicted estimate is checked at once, others at regular intervals.
         contradicted = started and levels[NEWEST] > levels[USUAL]
         if counters[SINCE_CHECK] == 0 or contradicted:
-            gram, check = grams[k, 0].copy(), grams[k, 1].copy()
+            gram, check = symmetric(grams[k, 0], n + 1), symmetric(grams[k, 1], n + 1)
             result = flag_uncertain(gram, levels[LEFT], theta[k], roots, omega[k], clock, span, elapsed)
             if contradicted or result:
                 result |= UNCERTAIN

@@ -201,7 +201,7 @@ class OnlineMixing(Online):
         self._reach = filled + int(self._ages[-1]) + 1
         self._enough = min(options.rows_before_valid(self.clock), window)
         self._used = 0.0
-        window_of_sums = np.zeros((window + 1, n + 3 + 2 * (n + 1) ** 2))
+        window_of_sums = np.zeros((window + 1, n + 3 + (n + 1) * (n + 2)))
         self._sliding = window_of_sums[1:], window_of_sums[0], np.zeros(1, np.int64)
         self._checks = Checks(filled + window, np.full(n, np.nan), np.zeros(3), np.array([0, 0, 1 << 50, 1 << 50]))
 
@@ -221,7 +221,8 @@ class OnlineMixing(Online):
         # Regressions with an overflowing square are not used.
         found = np.asarray(np.isfinite(squares).all(axis=1))
         mixed[~found] = squares[~found] = np.nan
-        products = [(own[:, :, None] * own[:, None, :]).reshape(count, -1) for own in rows]
+        one, other = np.triu_indices(n + 1)
+        products = [own[:, one] * own[:, other] for own in rows]
         entries = np.hstack((squares, found[:, None], np.isfinite(rows[0, :, :1]), *products))
         sums = np.empty(entries.shape)
         slide(np.nan_to_num(entries, copy=False), *self._sliding, sums)
@@ -233,7 +234,7 @@ class OnlineMixing(Online):
         flags[~found & (used > 0)] |= int(Flag.GAP)
         flags[~excited & (used > 0)] |= int(Flag.UNDETERMINED)
         counts = np.column_stack((excited * sums[:, n + 2], self._reach + support, self._reach + used))
-        grams = sums[:, n + 3 :].reshape(count, 2, n + 1, n + 1)
+        grams = sums[:, n + 3 :].reshape(count, 2, -1)
         check_estimates(theta, rows[0], grams, counts, self.clock, self._checks, omega, flags)
 
 
