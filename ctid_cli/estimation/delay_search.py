@@ -74,10 +74,9 @@ class Minima(NamedTuple):
 
 
 def lowest_minima(costs: Array, most: int) -> IndexArray:
-    """Return the indices of the lowest local minima of a profile, lowest first."""
+    """Return the indices of the lowest local minima of a profile, lowest first; of equal neighbours only the last."""
     padded = np.concatenate(([np.inf], costs, [np.inf]))
-    lowest = (costs <= padded[:-2]) & (costs <= padded[2:]) & np.isfinite(costs)
-    indices = np.flatnonzero(lowest)
+    indices = np.flatnonzero((costs <= padded[:-2]) & (costs < padded[2:]))
     return indices[np.argsort(costs[indices], kind="stable")][:most]
 
 

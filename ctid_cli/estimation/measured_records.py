@@ -181,7 +181,7 @@ class MeasuredRecords:
                 raise DataError(
                     f"{named(record)}the input {f'{name} ' * record.several}is constant ({first:g}) over the whole "
                     "record; if the record begins with its step, give the level of the input before it: input_before "
-                    "(--input-before VALUE)"
+                    "(--input-before VALUE); else take a record in which the input changes"
                 )
 
     def _lay_out(self, record: Record) -> FilterData:

@@ -25,11 +25,11 @@ from ctid_cli.identification.initial_states import (
     beginning_is_likely,
     changes_at_the_beginning_only,
     excited_after,
+    parts_of,
     states_of,
     without_beginning,
 )
-from ctid_cli.identification.parts import parts_of
-from ctid_cli.identification.remedies import without_harmful_outliers
+from ctid_cli.identification.remedies import harmful_outliers, without_samples
 from ctid_cli.inference.input_response import analyse_response
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.models.several_inputs import AnyModel, delays_of
@@ -84,20 +84,14 @@ def choose(records: Record | Sequence[Record], given: Given | None = None, time_
     best = choice.ranking.best
     if given.loss is not None or given.noise_model != "white" or isinstance(best.fit, MultiInputFit):
         return choice
-    clean = without_harmful_outliers(choice.fitted, best.options, best.fit)
-    if clean is None:
+    outliers = harmful_outliers(choice.fitted, best.options, best.fit)
+    if outliers is None:
         return choice
     # All else is chosen again, without the outliers.
-    instants = [
-        record.t[np.isnan(kept.y) & ~np.isnan(record.y)] for record, kept in zip(choice.fitted, clean, strict=True)
-    ]
-    several = [
-        replace(record, y=np.where(np.isin(record.t, at), np.nan, record.y))
-        for record, at in zip(several, instants, strict=True)
-    ]
-    chosen = _Choosing(several, replace(given, loss="tukey"), time_unit).choice()
+    clean = list(without_samples(several, outliers))
+    chosen = _Choosing(clean, replace(given, loss="tukey"), time_unit).choice()
     held = tuple(with_hold(record, chosen.records[0].hold) for record in choice.records)
-    left_out = sentences.of_outliers(sum(map(len, instants)))
+    left_out = sentences.of_outliers(sum(map(len, outliers)))
     return replace(chosen, records=held, sentences=(left_out, *chosen.sentences))
 
 

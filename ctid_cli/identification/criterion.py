@@ -12,10 +12,11 @@ noise.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.measured_fit import MeasuredFit
@@ -30,8 +31,6 @@ from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
 from ctid_cli.models.additive import terms_text
 from ctid_cli.signals.treatment import Holds
 
-#: Output errors of records, and their derivatives with respect to the parameters of a least-squares step.
-Errors = tuple[Sequence[Array], Sequence[Array]]
 #: Options of the compared models: one transfer function, or a sum of submodels.
 Searched = DelayProfile | AdditiveOutputError
 #: Penalty of a parameter over that in BIC. For 134 simulated records of known structure, models so chosen had at most
@@ -39,6 +38,22 @@ Searched = DelayProfile | AdditiveOutputError
 PENALTY = 1.5
 #: Names of the bounds at which a pole pair follows an oscillation of this record's noise.
 UNDAMPED = frozenset({"least_damping", "imaginary"})
+
+
+class Errors(NamedTuple):
+    """Output errors of records, and their derivatives with respect to the parameters of a least-squares step."""
+
+    residuals: Sequence[Array]
+    slopes: Sequence[Array]
+
+    @classmethod
+    def of(cls, fit: MeasuredFit) -> "Errors":
+        """Return those of a fit."""
+        return cls(fit.residuals, [psi @ fit.tangent for psi in fit.sensitivities])
+
+    def innovations(self, noise: NoiseModel) -> tuple[float, int]:
+        """Return the sum of squared innovations after one step, and their number."""
+        return squared_innovations(*self, noise), innovations_count(self.residuals, noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,14 +158,17 @@ def in_order(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
     return tuple(sorted(candidates, key=lambda each: (not each.is_admissible, each.criterion)))
 
 
-def criteria_of(models: Sequence[Errors], parameters: Sequence[int]) -> list[float]:
-    """Return the criterion of models of the same samples, with the noise model of the closest one."""
-    closest, _ = min(models, key=lambda model: sum(float(e @ e) for e in model[0]))
-    noise = noise_of(closest)
-    return [
-        penalised(squared_innovations(errors, slopes, noise), innovations_count(errors, noise), size)
-        for (errors, slopes), size in zip(models, parameters, strict=True)
-    ]
+def criteria_of(
+    models: Sequence[Errors], used: Sequence[Sequence[BoolArray]], parameters: Sequence[int]
+) -> list[float]:
+    """Return the criterion of models at the samples that all use, with the noise model of the closest one."""
+    common = [np.logical_and.reduce(uses) for uses in zip(*used, strict=True)]
+    kept = []
+    for model, own in zip(models, used, strict=True):
+        places = [mask[use] for mask, use in zip(common, own, strict=True)]
+        kept.append(Errors(*([x[at] for x, at in zip(part, places, strict=True)] for part in model)))
+    noise = noise_of(min((each.residuals for each in kept), key=lambda errors: sum(float(e @ e) for e in errors)))
+    return [penalised(*each.innovations(noise), size) for each, size in zip(kept, parameters, strict=True)]
 
 
 def noise_of(residuals: Sequence[Array]) -> NoiseModel:
@@ -159,11 +177,9 @@ def noise_of(residuals: Sequence[Array]) -> NoiseModel:
 
 
 def _with_criterion(candidate: Candidate, noise: NoiseModel) -> Candidate:
-    fit, size = candidate.fit, candidate.size
-    count = innovations_count(fit.residuals, noise)
-    squared = squared_innovations(fit.residuals, [psi @ fit.tangent for psi in fit.sensitivities], noise)
-    criteria = information_criteria(squared, count, size)
-    return replace(candidate, criterion=penalised(squared, count, size), criteria=criteria)
+    squared, count = Errors.of(candidate.fit).innovations(noise)
+    criteria = information_criteria(squared, count, candidate.size)
+    return replace(candidate, criterion=penalised(squared, count, candidate.size), criteria=criteria)
 
 
 def penalised(squared: float, count: int, parameters: int) -> float:

@@ -6,18 +6,19 @@ from dataclasses import replace
 import numpy as np
 
 from ctid_cli.arrays import BoolArray
+from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Identification, unsafe_intervals
 from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
 from ctid_cli.estimators.reported_parameters import delay_names, free_directions
 from ctid_cli.identification.changes import Kind
 from ctid_cli.identification.remedies import Remedy, Trials, tried_remedies
-from ctid_cli.identification.sentences import spelled
+from ctid_cli.identification.sentences import outlying, spelled
 from ctid_cli.inference.covariance import condition_number, describe_conditioning
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, input_dependence
 from ctid_cli.inference.signal_features import growth_time, residual_outliers, saturated
 from ctid_cli.inference.uncertainty import Uncertainty
-from ctid_cli.models.several_inputs import delays_of
+from ctid_cli.models.several_inputs import delays_of, fractions_of
 from ctid_cli.signals.record import Record
 from ctid_cli.text import count, listed, probability
 
@@ -27,6 +28,9 @@ AHEAD = "the delay is too long, the output was recorded ahead of the input, or a
 MOST = 5
 #: A fit below this is reported [%].
 LOW_FIT = 80.0
+#: A validation record is reported if its fit is low and its root mean square error exceeds that of the fit this many
+#: times: in 4,000 draws of AR(1) noise of .95, 150 samples have four times the variance of 300 others in .2 %.
+GREATER = 2.0
 #: Significance levels at which residuals depend on the input, and the input on residuals (stricter, because many inputs
 #: are tested), and least share of the residuals' variance that such feedback explains.
 DEPENDENT, FED_BACK, FEEDBACK_SHARE = 0.01, 1e-4, 0.01
@@ -142,8 +146,7 @@ def _outliers(found: Identification, time_unit: str) -> str:
         )
     if not total:
         return ""
-    what = "1 output sample is an outlier" if total == 1 else f"{total} output samples are outliers"
-    return f"{what} ({'; '.join(listed_times)}), up to {largest:.3g} away from the neighbours"
+    return f"{outlying(total)} ({'; '.join(listed_times)}), up to {largest:.3g} away from the neighbours"
 
 
 def _slow_pole(found: Identification, time_unit: str) -> str:
@@ -157,17 +160,31 @@ def _slow_pole(found: Identification, time_unit: str) -> str:
     return f"{what}: over a record of {longest:.4g} {time_unit} it is nearly indistinguishable from an integrator"
 
 
+def _of_cancelled_integrator(found: Identification, time_unit: str) -> Iterator[str]:
+    """Yield that a zero nearly cancels the integrator, which then describes a drift of the output."""
+    longest = max(record.duration for record in found.records)
+    for model in fractions_of(found.fit.model) if isinstance(found.options, DelayProfile) else ():
+        zero = min(model.zeros.real[model.zeros.imag == 0.0], key=abs, default=np.inf)
+        if model.denominator[-1] == 0.0 and abs(zero) * longest < 1.0:
+            gain = model.numerator[-2] / model.denominator[-2]
+            what = f"The zero at {zero:.2g} rad/{time_unit} nearly cancels the integrator over this record"
+            yield f"{what}, which describes a drift of the output; without both the static gain is {gain:.3g}"
+
+
 # --- observations without a remedy -------------------------------------------------------------------
 
 
 def _of_validation(found: Identification) -> Iterator[str]:
-    fitted, other = found.fit.r2, found.validation
-    if other is not None and (shared := found.seen_in_validation):
+    fit, other = found.fit, found.validation
+    if other is None:
+        return
+    if shared := found.seen_in_validation:
         what = f"{shared} of the {count(other.record.n_samples, 'sample')} of the validation record are those that"
         yield f"{what} the model was estimated from, so its fit there is no test; give a record without them"
-    if other is not None and other.r2 < 0.5 < fitted:
-        what = f"The model explains {100 * fitted:.0f} % of the variance of the record it was estimated from, but only"
-        yield f"{what} {100 * max(other.r2, 0.0):.0f} % of the validation record's: the model does not generalise"
+    ratio = float(np.sqrt(np.mean(np.square(other.applied.residuals[0])) / max(fit.cost, np.finfo(float).tiny)))
+    if other.fit_percent < LOW_FIT and ratio > GREATER and fit.weighting is None:
+        what = f"The root mean square error on the validation record is {ratio:.2g} times that of the fit"
+        yield f"{what}: the model does not generalise, or there is more noise"
 
 
 def _of_residuals(found: Identification, remedied: set[Kind], time_unit: str) -> Iterator[str]:
@@ -271,6 +288,7 @@ def _of_uncertainty(found: Identification, time_unit: str) -> Iterator[str]:
     """Yield what the record does not determine, and which intervals are unreliable."""
     if slow := _slow_pole(found, time_unit):
         yield slow
+    yield from _of_cancelled_integrator(found, time_unit)
     fit, uncertainty = found.fit, found.uncertainty
     yield from of_conditioning(fit, fit.uncertainty("white") if uncertainty.kind == "biased" else uncertainty)
     if uncertainty.short:

@@ -1,17 +1,20 @@
-"""Assumed state and offset of records, and the samples at which they can be compared."""
+"""Assumed states before records, and the samples on which they are compared."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from ctid_cli.estimation.optimum.best_model import most_active
+from ctid_cli.estimation.record_preparation import part_of_record
 from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import Candidate
 from ctid_cli.inference.noise_model import NoiseModel
 from ctid_cli.inference.residual_tests import chi_square_tail
-from ctid_cli.inference.signal_features import FEW_CHANGES
-from ctid_cli.signals.record import Record
+from ctid_cli.inference.signal_features import FEW_CHANGES, input_moves
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record, beginning
 from ctid_cli.signals.treatment import InitialState, InputBefore
 
 #: Share of its range that the input must cross after the greatest delay, so that an estimated state leaves the gain
@@ -23,6 +26,10 @@ EXCITED = 0.5
 LEAD = 10
 #: Rest is rejected if its first samples are less likely than this: an unneeded estimated state costs little.
 UNLIKELY = 1e-2
+#: Samples of all records to which models are fitted for the choice: what can be computed in ten seconds.
+PART = 2500
+#: The beginning of a record is used for the whole if input and output vary there by at least this share of all.
+LIVELY = 0.5
 
 
 #: State before the records, and the input before them.
@@ -78,6 +85,27 @@ def without_beginning(records: Sequence[Record], length: float) -> list[Record]:
         replace(record, y=np.where(record.t < record.t[0] + length * (1 - 1e-9), np.nan, record.y), noise_free=None)
         for record in records
     ]
+
+
+def parts_of(records: Sequence[Record]) -> tuple[list[Record], bool]:
+    """Return parts with at most ``PART`` samples in total, and whether all start at the beginning of their records."""
+    found = [_part(record, PART // len(records)) for record in records]
+    return [record for record, _ in found], all(from_start for _, from_start in found)
+
+
+def _part(record: Record, most: int) -> tuple[Record, bool]:
+    thinned = -(-record.n_samples // most)
+    if thinned > 1 and not record.several:
+        signal, y = record.input, record.bridged_y
+        if input_moves(record).kind in ("constant", "steps") or not np.array_equal(signal.t, record.t):
+            # The input changes rarely, and all changes are needed.
+            moves = np.append(True, np.diff(signal.values) != 0) | (signal.hold != "zoh")
+            held = HeldSignal(signal.t[moves], signal.values[moves], signal.hold)
+            return Record(record.t[::thinned], record.y[::thinned], held, name=record.name), True
+        if any(np.std(x[:most]) < LIVELY * np.std(x) for x in (signal.values, y)):
+            where = most_active(signal.values, y, most)
+            return part_of_record(record, where), where.start == 0
+    return beginning(record, most), True
 
 
 def beginning_is_likely(best: Candidate, noise: NoiseModel, records: Sequence[Record], length: float) -> bool:

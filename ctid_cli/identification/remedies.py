@@ -1,19 +1,21 @@
 """Changes of a fit that are tried on its own records, and selection of those that help."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from operator import is_not
 from typing import NamedTuple, get_args
 
 import numpy as np
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import CtidError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Options
 from ctid_cli.estimators.measured_fit import MeasuredFit
 from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.changes import CHANGES, Change, FittedOptions, Kind, option_of
-from ctid_cli.identification.criterion import criteria_of
+from ctid_cli.identification.criterion import Errors, criteria_of
 from ctid_cli.identification.held_back import compared, long_enough
 from ctid_cli.inference.signal_features import residual_outliers
 from ctid_cli.signals.record import Record, beginning
@@ -109,9 +111,9 @@ def tried_remedies(
     try:
         if any(map(is_not, part, records)):
             base = _refitted(base, part)
-        clean = without_outliers(part, base.fit)
-        if clean is not None:
-            base = _refitted(_with_best(base, ("loss",), found)[0], clean)
+        at = outlier_instants(part, base.fit)
+        if any(map(len, at)):
+            base = _refitted(_with_best(base, ("loss",), found)[0], without_samples(part, at))
         kinds: tuple[Kind, ...] = get_args(Kind)[1:] if suspicious else ("treatment",)
         kinds = kinds if response else ("delay",)
         while kinds and len(found.remedies) < MOST_NAMED:
@@ -121,29 +123,25 @@ def tried_remedies(
     return found
 
 
-def without_harmful_outliers(
-    records: tuple[Record, ...], options: Options, fit: MeasuredFit
-) -> tuple[Record, ...] | None:
-    """Return the records with the outliers of a fit as missing if another loss helps; else None."""
-    found = Trials([], [])
-    try:
-        clean = without_outliers(records, fit)
-        if clean is not None and isinstance(options, DelayProfile):
+def harmful_outliers(records: tuple[Record, ...], options: Options, fit: MeasuredFit) -> list[Array] | None:
+    """Return the instants of the outliers of a fit in each record if another loss helps; else None."""
+    found, at = Trials([], []), outlier_instants(records, fit)
+    with suppress(CtidError):
+        if any(map(len, at)) and isinstance(options, DelayProfile):
             _with_best(FittedOptions(options, records[0].hold, records, fit), ("loss",), found)
-    except CtidError:
-        return None
-    return clean if found.remedies else None
+    return at if found.remedies else None
 
 
-def without_outliers(records: Sequence[Record], fit: MeasuredFit) -> tuple[Record, ...] | None:
-    """Return the records with the outliers of a fit as missing; None if there are none."""
-    law, found, total = fit.linear, [], 0
-    for record, use, e in zip(records, law.used, law.residuals, strict=True):
-        y, places = record.y.copy(), residual_outliers(e)[0]
-        y[np.flatnonzero(use)[places]] = np.nan
-        found.append(replace(record, y=y))
-        total += places.size
-    return tuple(found) if total else None
+def outlier_instants(records: Sequence[Record], fit: MeasuredFit) -> list[Array]:
+    """Return the instants of the outliers of a fit in each record [s]."""
+    each = zip(records, fit.linear.used, fit.linear.residuals, strict=True)
+    return [record.t[use][residual_outliers(e)[0]] for record, use, e in each]
+
+
+def without_samples(records: Sequence[Record], instants: Sequence[Array]) -> tuple[Record, ...]:
+    """Return records whose output is missing at some instants."""
+    each = zip(records, instants, strict=True)
+    return tuple(replace(record, y=np.where(np.isin(record.t, at), np.nan, record.y)) for record, at in each)
 
 
 def _refitted(base: FittedOptions, records: tuple[Record, ...]) -> FittedOptions:
@@ -207,7 +205,9 @@ def _helpful(base: FittedOptions, kind: Kind, changed: FittedOptions) -> Helpful
     made = kind, option_of(base, changed), changed.options, changed.hold
     try:
         # Another loss must improve the fit of the samples that are no outliers.
-        clean = (kind == "loss" and without_outliers(base.records, base.fit)) or base.records
+        clean = base.records
+        if kind == "loss":
+            clean = without_samples(clean, outlier_instants(clean, base.fit))
         errors = [np.where(record.valid, e, np.nan) for record, e in zip(clean, base.errors, strict=True)]
         gain = compared(errors, changed.errors, base.records)
     except CtidError:
@@ -234,11 +234,5 @@ def _simplest(helpful: Sequence[Helpful]) -> Helpful:
 
 def criteria(*fits: FittedOptions) -> list[float]:
     """Return the criterion of fits at the samples that all use, under one noise model."""
-    common = [np.logical_and.reduce(uses) for uses in zip(*(one.fit.used for one in fits), strict=True)]
-    models = []
-    for fit in (one.fit for one in fits):
-        places = [mask[use] for mask, use in zip(common, fit.used, strict=True)]
-        errors = [e[at] for e, at in zip(fit.residuals, places, strict=True)]
-        slopes = [(psi @ fit.tangent)[at] for psi, at in zip(fit.sensitivities, places, strict=True)]
-        models.append((errors, slopes))
-    return criteria_of(models, [one.parameters for one in fits])
+    models = [Errors.of(each.fit) for each in fits]
+    return criteria_of(models, [each.fit.used for each in fits], [each.parameters for each in fits])

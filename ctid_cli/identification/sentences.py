@@ -38,10 +38,14 @@ def _integrators(number: int) -> str:
     return f" and {count(number, 'integrator')}" if number else ""
 
 
+def outlying(number: int) -> str:
+    """Return the number of outliers in words."""
+    return "1 output sample is an outlier" if number == 1 else f"{number} output samples are outliers"
+
+
 def of_outliers(number: int) -> str:
     """Describe the loss chosen for outliers."""
-    what = "1 output sample is an outlier" if number == 1 else f"{number} output samples are outliers"
-    return f"Loss: tukey (--loss), as {what}; all else is chosen without {'it' if number == 1 else 'them'}."
+    return f"Loss: tukey (--loss), as {outlying(number)}; all else is chosen without {'it' if number == 1 else 'them'}."
 
 
 def rest_assumed(options: Searched) -> str:

@@ -1,17 +1,57 @@
-"""Models on a record from which they were not estimated, with its own state and offset."""
+"""Models on another record, with its own state and offset, and diagnostics of the candidates of a choice."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimators.identification import Validation, laid_out_validation, validated
+from ctid_cli.estimators.identification import Validation, laid_out_validation, tests_of, validated
 from ctid_cli.estimators.measured_fit import MeasuredFit
-from ctid_cli.identification.choice import Given
-from ctid_cli.identification.criterion import Searched, criteria_of
+from ctid_cli.identification.candidates import with_hold
+from ctid_cli.identification.choice import Choice, Given
+from ctid_cli.identification.criterion import Candidate, Errors, Searched, criteria_of
 from ctid_cli.identification.initial_states import states_of
+from ctid_cli.inference import criteria
+from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import Offset
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateDiagnostics:
+    """A candidate with its diagnostics."""
+
+    candidate: Candidate
+    #: Young's criterion [-].
+    yic: float
+    #: Fit of each tenth of each record with the parameters of the rest, linearised [%].
+    cross_validated_percent: float
+    tests: tuple[ResidualTests, ...]
+    #: Fit on the validation record [%].
+    validation_percent: float | None
+
+
+def diagnosed(choice: Choice, given: Given, validation: Record | None) -> list[CandidateDiagnostics]:
+    """Compute the diagnostics of all candidates of a choice, the best first."""
+    other = None if validation is None else with_hold(validation, choice.ranking.best.hold)
+    return [_diagnosed(each, choice, given, other) for each in choice.ranking.candidates]
+
+
+def _diagnosed(candidate: Candidate, choice: Choice, given: Given, other: Record | None) -> CandidateDiagnostics:
+    fit, options = candidate.fit, candidate.options
+    outputs = [record.y[use] for record, use in zip(choice.fitted, fit.used, strict=True)]
+    total = np.concatenate([y - y.mean() for y in outputs])
+    left = criteria.cross_validated_errors(*Errors.of(fit))
+    free = np.flatnonzero(fit.tangent.any(axis=1))
+    covariance = fit.uncertainty("white").covariance[np.ix_(free, free)]
+    residuals = np.concatenate(fit.residuals)
+    return CandidateDiagnostics(
+        candidate,
+        criteria.young_information_criterion(residuals, np.concatenate(outputs), fit.theta[free], covariance),
+        criteria.fit_percent(total, total - np.concatenate(left)),
+        tests_of(options, fit, choice.fitted),
+        None if other is None else validated_on(other, options, fit, given).fit_percent,
+    )
 
 
 def laid_out_for(record: Record, options: Searched, given: Given) -> list[tuple[Searched, MeasuredRecords]]:
@@ -30,8 +70,7 @@ def validated_on(record: Record, options: Searched, fit: MeasuredFit, given: Giv
     """Assess a fixed model on a record, in the treatment that the criterion prefers."""
     tried = laid_out_for(record, options, given)
     applied = [own._applied(fit, laid_out) for own, laid_out in tried]
-    common = np.logical_and.reduce([each.used[0] for each in applied])
-    left = [each.residuals[0][common[each.used[0]]] for each in applied]
+    models = [Errors(each.residuals, [np.zeros((e.size, 0)) for e in each.residuals]) for each in applied]
     sizes = [laid_out.layout.own for _, laid_out in tried]
-    best = int(np.argmin(criteria_of([([e], [np.zeros((e.size, 0))]) for e in left], sizes)))
+    best = int(np.argmin(criteria_of(models, [each.used for each in applied], sizes)))
     return replace(validated(applied[best], record), options=tried[best][0])

@@ -204,11 +204,21 @@ def decompose(record: Record) -> Decomposition:
     # A very large offset would cause rounding errors in products.
     shift = middle if abs(middle) > FAR * float(np.std(record.y[places])) else 0.0
     removed, far = places[_gross(record.y[places])], np.zeros(0, dtype=np.int64)
+    known = ("offset",) if shift else ()
+    values = record.input.values
+    first, low, high = float(values[0]), float(values.min()), float(values.max())
+    befores = {0.0, first}
     for _ in range(ROUNDS):
         removed = np.union1d(removed, far)
         used = np.setdiff1d(places[::every], removed)
-        model = fit_response(Signals(record.t[used], record.y[used] - shift, record.input, interval))
-        terms = slow_terms(model, ("offset",) if shift else ())
+        signals = Signals(record.t[used], record.y[used] - shift, record.input, interval)
+        model = fit_response(signals, befores)
+        terms = slow_terms(model, known)
+        if terms["start"].detected and not low <= model.layout.before <= high:
+            # Zero would be a step from rest, which the output does not show.
+            befores = {first}
+            model = fit_response(signals, befores)
+            terms = slow_terms(model, known)
         slow = slow_columns(model, terms)
         response, rest = model.parts(slow)
         far = used[outlying(model, rest)]

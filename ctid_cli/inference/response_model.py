@@ -21,7 +21,7 @@ References
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -293,13 +293,12 @@ def whitened(columns: Array, noise: NoiseModel) -> Array:
     return white
 
 
-def fit_response(signals: Signals) -> ResponseModel:
-    """Fit the response of an output to a varying input."""
+def fit_response(signals: Signals, befores: Collection[float]) -> ResponseModel:
+    """Fit the response of an output to a varying input, which had one of some values before the record."""
     shortest = FASTEST * signals.interval
     longest = max(SLOWEST * float(np.ptp(signals.t)), 2 * shortest)
     decays = np.geomspace(shortest, longest, math.ceil(math.log(longest / shortest, RATIO)) + 1)
-    befores = sorted({0.0, float(signals.input.values[0])})
-    coarse = (Layout.of(signals, *pair, COARSE) for pair in itertools.product(befores, decays))
+    coarse = (Layout.of(signals, *pair, COARSE) for pair in itertools.product(sorted(befores), decays))
     model = _likeliest(coarse, [ar1(pole) for pole in NOISE_POLES], (False, True))
     near = np.clip(model.prior.decay * RATIO ** np.array([-0.5, 0.0, 0.5]), shortest, longest)
     fine = [Layout.of(signals, model.layout.before, float(decay), FINE) for decay in near]

@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
-from ctid_cli.identification.candidate_diagnostics import CandidateDiagnostics, diagnosed
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Candidate, Searched
 from ctid_cli.identification.sentences import spelled
+from ctid_cli.identification.validation import CandidateDiagnostics, diagnosed
 from ctid_cli.reporting.document import Column, Result, Section
 from ctid_cli.reporting.figures.style import LOOKS, MARK, Drawing, name_axes, plain
 from ctid_cli.reporting.layout import picked

@@ -136,6 +136,15 @@ def test_a_pole_that_is_as_slow_as_the_record_names_no_remedy_that_was_not_tried
     assert "--" not in slow or any(option in slow for option in options)
 
 
+def test_an_integrator_that_a_zero_cancels_is_a_drift():
+    record = record_of(TransferFunction([2.0, 0.002], [1.0, 0.8, 2.0, 0.0]))
+    found = identify([record], DelayProfile(2, 1, (0, 0), integrators=1))
+    (drift,) = (warning for warning in found.warnings if "cancels the integrator" in warning)
+    assert drift.endswith("without both the static gain is 1.")
+    without = identify([record_of(INTEGRATING)], DelayProfile(2, 0, (0, 0), integrators=1))
+    assert not any("cancels" in warning for warning in without.warnings)
+
+
 def test_a_low_fit_says_what_was_tried_without_gain():
     loud = changed(CLEAN, CLEAN.y + 10 * NOISE * np.random.default_rng(7).standard_normal(1000))
     result = identify([loud], KNOWN)

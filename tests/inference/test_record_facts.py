@@ -61,6 +61,14 @@ def test_a_fault_is_stated_and_no_other(fault):
     assert stated(record_facts(faulty(fault))) == {fault}
 
 
+def test_zero_is_no_rest_of_an_input_that_is_far_from_it():
+    record = faulty("start")
+    far = HeldSignal(record.input.t, record.input.values + 10.0)
+    parts = record_facts(Record(record.t, record.y + 10.0, far)).parts
+    assert parts.start.detected
+    assert parts.input_at_rest == far.values[0]
+
+
 @pytest.mark.parametrize("irregular", [False, True])
 @pytest.mark.parametrize("colour", [0.0, 0.95])
 def test_a_clean_record_has_no_faults_and_its_numbers_hold_the_truth(colour, irregular):

@@ -9,6 +9,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.estimation.delay_search import lowest_minima
 from ctid_cli.estimation.optimum.box import LIMITS, Box, Point, point_of
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem, responses
@@ -386,13 +387,6 @@ def with_added_poles(
         if apart and len(chosen) < most:
             chosen.append(k)
     return [points[k] for k in chosen]
-
-
-def lowest_minima(values: Array, most: int) -> list[int]:
-    """Return the indices of the lowest local minima, the lowest first."""
-    padded = np.concatenate(([np.inf], values, [np.inf]))
-    minima = np.flatnonzero((values <= padded[:-2]) & (values < padded[2:]))
-    return [int(k) for k in minima[np.argsort(values[minima])[:most]]]
 
 
 # --- several denominators: each is fitted to the residual of the others -------------------------------
