@@ -53,7 +53,11 @@ LOOP = {
     "--noise": "drop it, or fit to the input with --direct",
     "--bound": "drop it, or fit to the input with --direct",
 }
-UNSTABLE_SUM = {"--model": "a sum of submodels is stable; drop it"}
+UNSTABLE = {
+    "--model": "a sum of submodels is stable; drop it",
+    "--fix": "drop it",
+    "--noise": "drop it, or leave --reference out",
+}
 ONE_FRACTION_IN_LOOP = {"--fix": "add --model additive --terms POLES/ZEROS, for the names of submodels"}
 #: Options by their names in estimators.
 OPTIONS = {
@@ -368,7 +372,7 @@ class ModelRequest:
         purpose = "the reference as an instrument" if by_reference else model
         purpose = "a plant that may be unstable" if unstable else purpose
         has_submodels = self.is_sum or (by_reference and not unstable and options.common("integrators"))
-        refused = LOOP | ({} if has_submodels else ONE_FRACTION_IN_LOOP) | (UNSTABLE_SUM if unstable else {})
+        refused = LOOP | ({} if has_submodels else ONE_FRACTION_IN_LOOP) | (UNSTABLE if unstable else {})
         if unstable and not by_reference:
             refused = {option: cure for option, cure in refused.items() if option != "--noise"}
         refuse_options(given, refused, purpose)

@@ -53,13 +53,18 @@ class UnknownController:
         return all(record.loop is not None for record in self.records)
 
     def around(self, theta: Array) -> LoopProblem | None:
-        """Return the problem with a controller that stabilises a model; None if there is none."""
+        """Return the problem with a stable controller that stabilises a model; None if none is found.
+
+        Signals of the record filtered by an unstable controller would grow.
+        """
         poles, _, integrators = self.structure
         a = np.concatenate(([1.0], theta[:poles], np.zeros(integrators)))
         interval = self.records[0].interval or 0.0
         try:
             controller = stabilising_controller(TransferFunction(theta[poles:-1], a, self.delay), interval)
         except (DataError, ValueError, np.linalg.LinAlgError):
+            return None
+        if not np.abs(controller.poles).max(initial=0.0) < 1.0:
             return None
         found = self._with(controller)
         return replace(found, instruments=self._with(controller, projected=True)) if self.by_reference else found
@@ -99,12 +104,14 @@ class UnknownController:
             (self._cost(theta), theta) for theta in replace(self._with(nothing), parts=tuple(parts)).starts(self.delay)
         ]
         lowest = sorted((cost, k) for k, (cost, _) in enumerate(starts) if np.isfinite(cost))[:REFINED]
-        found = [self.local(starts[k][1]) for _, k in lowest]
-        return LoopEstimate.least([one for one in found if one is not None])
+        found = [one for one in (self.local(starts[k][1]) for _, k in lowest) if one is not None]
+        ended = [one for one in found if one.status is Status.CONVERGED]
+        return LoopEstimate.least(ended or found)
 
     def _cost(self, theta: Array) -> float:
+        """Return the squares of the innovations, or of the error of the response to the reference."""
         problem = self.around(theta)
-        return np.inf if problem is None else problem.squared_error(theta)
+        return np.inf if problem is None else (problem.instruments or problem).squared_error(theta)
 
     def local(self, *starts: Array) -> LoopEstimate | None:
         """Return the minimum in the basin of a start."""
@@ -116,7 +123,9 @@ class UnknownController:
             )
             if problem is None or result is None:
                 break
-            theta, found = result.theta, LoopEstimate(problem, result)
+            theta, cost = result.theta, self._cost(result.theta)
+            comparable = replace(result, equations=result.equations._replace(squared_error=cost))
+            found = LoopEstimate(problem, comparable)
             if result.status is Status.CONVERGED and result.iterations <= FEW:
                 break
         return found

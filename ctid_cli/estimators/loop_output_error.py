@@ -117,7 +117,9 @@ class LaidOutLoop:
             return replace(problem, cell=problem.cell_of(theta[-1])) if low < high else problem
         found = problem.around(theta)
         if found is None:
-            raise DataError("no controller stabilises this model; use other poles and zeros, or another delay")
+            raise DataError(
+                "no stable controller is found that stabilises this model; use other poles and zeros, or another delay"
+            )
         return found
 
 

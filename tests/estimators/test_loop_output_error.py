@@ -249,7 +249,7 @@ REFUSED = {
     ),
     "missing samples": (
         LoopOutputError(1, 0),
-        Record(np.arange(50.0), [np.nan] * 2 + [1.0] * 48, HeldSignal(np.arange(50.0), np.arange(50.0))),
+        Record(np.arange(50.0), [np.nan, *np.cos(np.arange(49.0))], HeldSignal(np.arange(50.0), np.arange(50.0))),
         "without missing samples",
     ),
     "a delay in continuous time": (LoopOutputError(1, 0, (0.1, 0.1)), CONTINUOUS, "the delay must be 0"),

@@ -70,7 +70,7 @@ def test_unstable_plant_without_controller_and_reference():
 
 
 def test_coloured_noise_needs_the_reference_or_a_noise_model():
-    one = record(UNSTABLE, PD, noise=0.1, count=2500, colour=0.9, seed=3)
+    one = record(UNSTABLE, PD, noise=0.02, count=2500, colour=0.9, seed=3)
     unmodelled = LoopOutputError(2, 0).fit(alone(one))
     assert unmodelled.law.kind == "biased"
     assert np.isnan(list(unmodelled.standard_errors.values())).all()
