@@ -56,7 +56,7 @@ LOOP = {
 UNSTABLE = {
     "--model": "a sum of submodels is stable; drop it",
     "--fix": "drop it",
-    "--noise": "drop it, or leave --reference out",
+    "--reference": "drop it, or give the controller (--loop FILE)",
 }
 ONE_FRACTION_IN_LOOP = {"--fix": "add --model additive --terms POLES/ZEROS, for the names of submodels"}
 #: Options by their names in estimators.
@@ -373,7 +373,7 @@ class ModelRequest:
         purpose = "a plant that may be unstable" if unstable else purpose
         has_submodels = self.is_sum or (by_reference and not unstable and options.common("integrators"))
         refused = LOOP | ({} if has_submodels else ONE_FRACTION_IN_LOOP) | (UNSTABLE if unstable else {})
-        if unstable and not by_reference:
+        if unstable:
             refused = {option: cure for option, cure in refused.items() if option != "--noise"}
         refuse_options(given, refused, purpose)
         if options.terms is None and options.common("poles") is None:

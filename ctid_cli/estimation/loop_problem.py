@@ -65,8 +65,6 @@ class LoopProblem:
     #: Whether errors are innovations for white output noise, or for noise of a model: with an unknown controller.
     innovations: bool = False
     noise: ArmaNoise | None = None
-    #: Problem with a part of the reference, whose sensitivities are the instruments.
-    instruments: "LoopProblem | None" = None
 
     @property
     def data(self) -> FilterData:
@@ -125,20 +123,7 @@ class LoopProblem:
         return moved
 
     def columns(self, theta: Array, count: int | None = None) -> Columns | None:
-        """Return the signals of parameters with least-squares states and offsets; None if they are not finite.
-
-        With instruments the sensitivities are their projections on these (two-stage least squares).
-        """
-        own, count = self._own_columns(theta, count), self.free if count is None else count
-        if own is None or self.instruments is None or not count:
-            return own
-        behind = self.instruments.columns(theta, count)
-        if behind is None:
-            return None
-        basis = np.column_stack((behind.slopes, behind.linear))
-        return own._replace(slopes=basis @ np.linalg.lstsq(basis, own.slopes)[0])
-
-    def _own_columns(self, theta: Array, count: int | None) -> Columns | None:
+        """Return the signals of parameters with least-squares states and offsets; None if they are not finite."""
         found = [self._columns_of(part, theta, self.free if count is None else count) for part in self.parts]
         each = [columns for columns in found if columns is not None]
         if len(each) < len(found):

@@ -5,10 +5,8 @@ reference behind the controller, ``u = s - C y`` and
 
 .. math:: y = \frac{G}{1 + G C}\,s + \frac{1}{1 + G C}\,v,
 
-v being the output noise. The output error of this loop is finite for an unstable plant G too. Without the reference of
-the loop of the record, s contains noise, and the output error is filtered to innovations (direct method): they do not
-depend on C. With it, the part of s that follows the reference gives the instruments, the sensitivities of its response,
-and the estimate is consistent for any noise.
+v being the output noise. The output error of this loop is finite for an unstable plant G too. It is filtered to
+innovations, which do not depend on C (direct method).
 """
 
 from dataclasses import dataclass, replace
@@ -17,11 +15,10 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.additive_problem import predicted_from
 from ctid_cli.estimation.iteration import Steps, iterate
 from ctid_cli.estimation.loop_columns import LoopPart
 from ctid_cli.estimation.loop_problem import REFINED, LoopEstimate, LoopProblem
-from ctid_cli.filtering.filter_data import FilterData, filter_data, plain_array
+from ctid_cli.filtering.filter_data import filter_data, plain_array
 from ctid_cli.filtering.loop import stabilising_controller
 from ctid_cli.filtering.loop_response import LoopResponse
 from ctid_cli.inference.fit import Status
@@ -31,8 +28,7 @@ from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record
 
 #: Largest number of controllers, and steps with each of them; a controller that needs few steps is the last one.
-CONTROLLERS, FEW = 20, 2
-STEPS, BY_INSTRUMENTS = Steps(10, 1e-6, "guarded"), Steps(10, 1e-6, "relaxed")
+CONTROLLERS, STEPS, FEW = 20, Steps(10, 1e-6, "guarded"), 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +42,6 @@ class UnknownController:
     offset: bool
     free_state: bool
     noise: ArmaNoise | None = None
-
-    @property
-    def by_reference(self) -> bool:
-        """Whether the reference of the loop is known."""
-        return all(record.loop is not None for record in self.records)
 
     def around(self, theta: Array) -> LoopProblem | None:
         """Return the problem with a stable controller that stabilises a model; None if none is found.
@@ -66,66 +57,44 @@ class UnknownController:
             return None
         if not np.abs(controller.poles).max(initial=0.0) < 1.0:
             return None
-        found = self._with(controller)
-        return replace(found, instruments=self._with(controller, projected=True)) if self.by_reference else found
+        return self._with(controller)
 
-    def _with(self, controller: DiscreteController, *, projected: bool = False) -> LoopProblem:
-        parts = []
-        for record in self.records:
-            data = filter_data(record)
-            s = self._reference(data, controller)
-            if projected and record.loop is not None:
-                s = s.mean() + predicted_from(record.loop.reference, s)
-            driven = data._replace(u=plain_array(s))
-            response = LoopResponse(driven, controller, False, *self.structure, controller_at_rest=True)
-            parts.append(LoopPart(data, response))
-        delays, innovations = (self.delay, self.delay), not self.by_reference
-        return LoopProblem(
-            tuple(parts), self.offset, self.free_state, delays, innovations=innovations, noise=self.noise
-        )
-
-    def _reference(self, data: FilterData, controller: DiscreteController) -> Array:
+    def _with(self, controller: DiscreteController) -> LoopProblem:
         from scipy.signal import lfilter  # slow to import
 
         b, a = controller.numerator, controller.denominator
-        return np.asarray(data.u + lfilter(np.concatenate((np.zeros(a.size - b.size), b)), a, data.y))
+        b, parts = np.concatenate((np.zeros(a.size - b.size), b)), []
+        for record in self.records:
+            data = filter_data(record)
+            driven = data._replace(u=plain_array(data.u + lfilter(b, a, data.y)))
+            response = LoopResponse(driven, controller, False, *self.structure, controller_at_rest=True)
+            parts.append(LoopPart(data, response))
+        delays = self.delay, self.delay
+        return LoopProblem(tuple(parts), self.offset, self.free_state, delays, innovations=True, noise=self.noise)
 
     # --- minima --------------------------------------------------------------------------------------
 
     def best(self, record: Record) -> LoopEstimate | None:
-        """Return the lowest minimum from starts with the reference, or the input, as instrument."""
+        """Return the lowest minimum from starts with the input as instrument."""
         # The output error of a controller of zero is that of the plant in open loop.
-        nothing = DiscreteController([0.0], [1.0])
-        parts = []
-        for part, each in zip(self._with(nothing).parts, self.records, strict=True):
-            driven = part.data if each.loop is None else part.data._replace(u=plain_array(each.loop.reference))
-            parts.append(LoopPart(part.data, replace(part.response, data=driven)))
-        starts = [
-            (self._cost(theta), theta) for theta in replace(self._with(nothing), parts=tuple(parts)).starts(self.delay)
-        ]
-        lowest = sorted((cost, k) for k, (cost, _) in enumerate(starts) if np.isfinite(cost))[:REFINED]
-        found = [one for one in (self.local(starts[k][1]) for _, k in lowest) if one is not None]
-        ended = [one for one in found if one.status is Status.CONVERGED]
-        return LoopEstimate.least(ended or found)
+        starts = list(self._with(DiscreteController([0.0], [1.0])).starts(self.delay))
+        costs = sorted((self._cost(theta), k) for k, theta in enumerate(starts))
+        found = (self.local(starts[k]) for cost, k in costs[:REFINED] if np.isfinite(cost))
+        return LoopEstimate.least([one for one in found if one is not None])
 
     def _cost(self, theta: Array) -> float:
-        """Return the squares of the innovations, or of the error of the response to the reference."""
         problem = self.around(theta)
-        return np.inf if problem is None else (problem.instruments or problem).squared_error(theta)
+        return np.inf if problem is None else problem.squared_error(theta)
 
     def local(self, *starts: Array) -> LoopEstimate | None:
         """Return the minimum in the basin of a start."""
         theta, found = starts[0], None
         for _ in range(CONTROLLERS):
             problem = self.around(theta)
-            result = (
-                None if problem is None else iterate(problem, theta, BY_INSTRUMENTS if self.by_reference else STEPS)
-            )
+            result = None if problem is None else iterate(problem, theta, STEPS)
             if problem is None or result is None:
                 break
-            theta, cost = result.theta, self._cost(result.theta)
-            comparable = replace(result, equations=result.equations._replace(squared_error=cost))
-            found = LoopEstimate(problem, comparable)
+            theta, found = result.theta, LoopEstimate(problem, result)
             if result.status is Status.CONVERGED and result.iterations <= FEW:
                 break
         return found

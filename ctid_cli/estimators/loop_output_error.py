@@ -165,11 +165,11 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
     two-stage least squares with filtered references as instruments. The estimate is invalid if the given controller is
     not that of the record.
 
-    For a record without a controller, one that stabilises the model is designed, and the loop that it makes of the
-    measured signals is simulated, see :mod:`ctid_cli.estimation.unknown_controller`. With the reference the estimate is
-    consistent for noise of any colour. Without it the cost is that of the innovations (direct method): the estimate is
-    efficient if the noise model is that of the output noise and there is a sample of delay in the loop, and biased
-    otherwise. The delay must be known, and the clock regular without missing samples.
+    For a record without reference and controller, one that stabilises the model is designed, and the loop that it makes
+    of the measured signals is simulated, see :mod:`ctid_cli.estimation.unknown_controller`. The cost is that of the
+    innovations (direct method): the estimate is efficient if the noise model is that of the output noise and there is a
+    sample of delay in the loop, and biased otherwise. The delay must be known, and the clock regular without missing
+    samples.
 
     Examples
     --------
@@ -270,6 +270,9 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
 
     def _unknown(self, records: Sequence[Record]) -> UnknownController:
         for record in records:
+            if record.loop is not None:
+                wrong = "a reference without its controller is not used for a plant that may be unstable"
+                raise DataError(f"{named(record)}{wrong}; give the controller too, or leave the reference out")
             wanted = "an unknown controller of an unstable plant needs"
             if not (record.input_on_grid and record.input.hold == "zoh"):
                 held = "an input that is held from sample to sample of a regular clock"
@@ -284,11 +287,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
                 "delay_bounds", "delay_bounds must be one known value without the controller, not a range"
             )
         offset, free = self.offset == "estimate", self.initial_state == "estimate"
-        found = UnknownController(tuple(records), self._structure, self.delay_bounds[0], offset, free)
-        if found.by_reference and self.noise_model != "white":
-            text = "noise_model is not needed with the reference, which is independent of any noise; use white"
-            raise OptionError("noise_model", text)
-        return found
+        return UnknownController(tuple(records), self._structure, self.delay_bounds[0], offset, free)
 
     def _estimate(self, laid_out: LaidOutLoop, start: Start | None) -> LoopFit:
         problem = laid_out.problem
@@ -333,7 +332,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
             starts=Starts(found.tried, found.agree),
             known=tuple(held),
             loop_radius=np.nan if unknown else found.radius,
-            sensitivity=None if problem.innovations else found.sensitivity,
+            sensitivity=None if unknown else found.sensitivity,
             in_ignored_loop=problem.innovations,
             cost=np.nan,
             fit_percent=np.nan,

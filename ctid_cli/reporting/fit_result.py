@@ -329,8 +329,7 @@ def _loop(options: Options, measurement: Measurement) -> Iterator[tuple[str, str
     if instruments == "reference":
         yield "loop", f"unknown controller; instruments from the reference r = {measurement.reference}"
     elif isinstance(options, LoopOutputError) and (loop is None or loop.controller is None):
-        how = "innovations" if loop is None else f"instruments from the reference r = {measurement.reference}"
-        yield "loop", f"unknown controller, replaced by one that stabilises the model; {how}"
+        yield "loop", "unknown controller, replaced by one that stabilises the model; innovations"
     elif instruments == "closed_loop" and loop is not None and loop.controller is not None:
         simulated = isinstance(options, LoopOutputError)
         how = "output error of the simulated loop, y - T r" if simulated else "instruments from the noise-free loop"

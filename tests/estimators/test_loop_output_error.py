@@ -242,10 +242,10 @@ CONTINUOUS = Record(
     *(lambda t: (t, np.cos(t), HeldSignal(t, np.sin(t))))(0.1 * np.arange(50)), loop=Loop(np.ones(50), LEAD)
 )
 REFUSED = {
-    "a constant reference": (
+    "a reference alone": (
         LoopOutputError(1, 0),
         replace(record(STABLE, PI), loop=Loop(np.ones(2000), None)),
-        "reference is constant",
+        "give the controller too",
     ),
     "missing samples": (
         LoopOutputError(1, 0),

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ctid_cli.errors import OptionError
+from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.filtering.loop import loop_radius, stabilising_controller
@@ -69,22 +69,21 @@ def test_unstable_plant_without_controller_and_reference():
     assert all(fit.standard_errors[name] < 1.2 * known.standard_errors[name] for name in TRUE)
 
 
-def test_coloured_noise_needs_the_reference_or_a_noise_model():
-    one = record(UNSTABLE, PD, noise=0.02, count=2500, colour=0.9, seed=3)
+def test_coloured_noise_needs_a_noise_model():
+    one = record(UNSTABLE, PD, noise=0.1, count=2500, colour=0.9, seed=3)
     unmodelled = LoopOutputError(2, 0).fit(alone(one))
     assert unmodelled.law.kind == "biased"
     assert np.isnan(list(unmodelled.standard_errors.values())).all()
     joint = LoopOutputError(2, 0, noise_model="arma:1,0").fit(alone(one))
     assert_near_the_truth(joint)
     assert joint.noise.noise.denominator[1] == pytest.approx(-0.9, abs=0.05)
-    assert_near_the_truth(LoopOutputError(2, 0).fit(replace(one, loop=Loop(one.loop.reference, None))))
 
 
 def test_options_that_an_unknown_controller_excludes():
     one = record(UNSTABLE, PD, count=300)
     with pytest.raises(OptionError, match="one known value"):
         LoopOutputError(2, 0, (0.0, 0.1)).fit(alone(one))
-    with pytest.raises(OptionError, match="not needed with the reference"):
-        LoopOutputError(2, 0, noise_model="auto").fit(replace(one, loop=Loop(one.loop.reference, None)))
+    with pytest.raises(DataError, match="leave the reference out"):
+        LoopOutputError(2, 0).fit(replace(one, loop=Loop(one.loop.reference, None)))
     with pytest.raises(OptionError, match="without controller"):
         LoopOutputError(2, 0, noise_model="auto").fit(one)
