@@ -123,8 +123,11 @@ def _fit_of_records(
     assessment.check(noise, {})
     loop.check()
     estimator = request.estimator()
-    if request.single and len(files) > 1:
-        raise UsageError(f"{len(files)} files are given, and a record in a loop is fitted alone; give one file")
+    if request.single and not request.simulated and len(files) > 1:
+        what = "a record is fitted alone without the controller of its loop, and by submodels"
+        raise UsageError(f"{len(files)} files are given, and {what}; give one file")
+    if loop.unstable and (assessment.predict or 1) > 1:
+        raise UsageError("--predict must be 1 for a plant that may be unstable: later outputs are not predicted")
     hold = "zoh" if request.hold == "auto" else request.hold
     records = columns.read_all(files, assessment.validate, hold, reference=loop.reference).treated(loop.applied)
     assessment.check(noise, {record.name: record.n_samples for record in records.all})

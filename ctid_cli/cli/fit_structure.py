@@ -35,7 +35,7 @@ UNKNOWN = "unknown"
 DIRECT = (
     "The model is fitted to the input as it was measured in the loop (direct method): that is right only if the noise "
     "model is (white noise of the output, or that of --noise), if there is a delay of a sample in the loop, and if the "
-    "plant is stable."
+    "plant is stable or --unstable is given."
 )
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]
@@ -52,6 +52,11 @@ LOOP = {
     "--loss": "drop it",
     "--noise": "drop it, or fit to the input with --direct",
     "--bound": "drop it, or fit to the input with --direct",
+}
+UNSTABLE = {
+    "--model": "a sum of submodels is stable; drop it",
+    "--fix": "drop it",
+    "--reference": "drop it, or give the controller (--loop FILE)",
 }
 ONE_FRACTION_IN_LOOP = {"--fix": "add --model additive --terms POLES/ZEROS, for the names of submodels"}
 #: Options by their names in estimators.
@@ -259,6 +264,7 @@ class LoopOptions:
     direct: Annotated[bool, flag("--direct", "Fit to the input as if there were no loop: noise through it biases.")] = (
         False
     )
+    unstable: Annotated[bool, flag("--unstable", "The plant may be unstable, in a loop that is not.")] = False
 
     @property
     def use(self) -> LoopUse:
@@ -280,6 +286,9 @@ class LoopOptions:
             raise UsageError(
                 "--direct says how a record in a loop is fitted; add --loop FILE or --loop unknown, or drop it"
             )
+        if self.unstable and (self.loop != UNKNOWN or self.direct):
+            known = "with --loop FILE and --reference COLUMN a plant may be unstable anyway"
+            raise UsageError(f"--unstable goes with --loop unknown, without --direct; {known}")
         if self.known is not None and self.reference is None and not self.direct:
             raise UsageError(
                 "--loop FILE needs the reference too; add --reference COLUMN, or --direct to fit without it"
@@ -327,13 +336,13 @@ class ModelRequest:
 
     @property
     def single(self) -> bool:
-        """Whether the estimator takes one record, in a loop."""
-        return self.loop.use != "none"
+        """Whether the estimator is one of records in a loop."""
+        return self.loop.use != "none" or self.loop.unstable
 
     @property
     def simulated(self) -> bool:
         """Whether the loop of one transfer function is simulated."""
-        return self.loop.use == "controller" and not self.is_sum
+        return (self.loop.use == "controller" or self.loop.unstable) and not self.is_sum
 
     def check(self) -> None:
         """Refuse options that the model does not have, unknown inputs, and missing degrees."""
@@ -358,15 +367,19 @@ class ModelRequest:
 
     def _check_loop(self, given: Sequence[str]) -> None:
         """Refuse options that the estimators of a record in a loop do not have."""
-        options, by_reference = self.options, self.loop.use == "reference"
+        options, by_reference, unstable = self.options, self.loop.use == "reference", self.loop.unstable
         model = "a sum of submodels in a loop" if self.is_sum else "a record in a loop"
         purpose = "the reference as an instrument" if by_reference else model
-        has_submodels = self.is_sum or (by_reference and options.common("integrators"))
-        refuse_options(given, LOOP | ({} if has_submodels else ONE_FRACTION_IN_LOOP), purpose)
+        purpose = "a plant that may be unstable" if unstable else purpose
+        has_submodels = self.is_sum or (by_reference and not unstable and options.common("integrators"))
+        refused = LOOP | ({} if has_submodels else ONE_FRACTION_IN_LOOP) | (UNSTABLE if unstable else {})
+        if unstable:
+            refused = {option: cure for option, cure in refused.items() if option != "--noise"}
+        refuse_options(given, refused, purpose)
         if options.terms is None and options.common("poles") is None:
             option = "--reference" if by_reference or self.is_sum else "--loop"
             raise UsageError(f"{'--terms' if self.is_sum else '--poles'} is missing: with {option} it must be given")
-        if self.simulated:
+        if self.loop.use == "controller" and self.simulated:
             return
         low, high = options.common("delay_bounds") or (0.0, 0.0)
         if low < high:
@@ -389,7 +402,8 @@ class ModelRequest:
         with as_usage_errors():
             if self.simulated:
                 degrees = options.common("poles"), options.common("zeros") or 0
-                return LoopOutputError(*degrees, delays, state, offset, options.common("integrators") or 0)
+                integrators = options.common("integrators") or 0
+                return LoopOutputError(*degrees, delays, state, offset, integrators, noise_model=options.noise)
             if self.single:
                 instruments: Instruments = "reference" if self.loop.use == "reference" else "closed_loop"
                 factored = self.is_sum or bool(options.common("integrators"))

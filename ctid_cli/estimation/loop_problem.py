@@ -4,11 +4,11 @@ r"""Output error of a feedback loop: output minus the response of the simulated 
 
 T contains the plant and the known controller. As r is independent of the noise, the least-squares estimate is
 consistent for any noise, and for unstable plants too; e is the noise filtered by the loop, and rarely white.
-State and offset c are eliminated by least squares for every theta (projection of the sensitivities, L. Kaufman,
-*A variable projection method for solving separable nonlinear least squares problems*, BIT 15 (1975) 49-57).
+State and offset c of each record are eliminated by least squares for every theta (projection of the sensitivities, L.
+Kaufman, *A variable projection method for solving separable nonlinear least squares problems*, BIT 15 (1975) 49-57).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -19,6 +19,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.additive_problem import AdditiveProblem, estimate_submodels, predicted_from
 from ctid_cli.estimation.iteration import Iterated, Steps, inadmissible, iterate
+from ctid_cli.estimation.loop_columns import Columns, LoopPart, as_innovations, stacked
 from ctid_cli.estimation.sampled_problem import reflect_unstable
 from ctid_cli.estimation.sum_start import automatic_start
 from ctid_cli.filtering.bank import Equations, standard_rows
@@ -26,9 +27,10 @@ from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.loop_response import LoopResponse
 from ctid_cli.filtering.submodels import OPEN_LOOP, LoopData
 from ctid_cli.inference.fit import Status
-from ctid_cli.inference.loop_noise import SensitivityFunction
+from ctid_cli.inference.loop_noise import MOST_MISSING, SensitivityFunction
 from ctid_cli.models.additive import Term
 from ctid_cli.models.factoring import unfactored
+from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record
 
 #: Number of cut-offs of the filters of starts, from six over the length of the record to half the Nyquist frequency; a
@@ -44,47 +46,15 @@ REFINED, MOST_DELAYS = 4, 60
 STEPS, FEW_STEPS = Steps(100, 1e-6, "guarded"), Steps(4, 1e-4, "guarded")
 #: Largest number of sampling intervals by which a delay may move to its minimum.
 MOST_CELLS = 30
-#: Relative singular value below which directions of state and offset are dropped.
-RANK = 1e-10
 #: Squared errors that differ by less than this fraction belong to one minimum.
 SAME = 1e-6
-
-
-class Columns(NamedTuple):
-    """Signals of an estimate at each used sample."""
-
-    #: Sensitivities to the parameters, shape (count, p).
-    slopes: Array
-    #: Responses to the first state, and ones if an offset is estimated, shape (count, f).
-    linear: Array
-    #: Measured output minus the response to the reference, shape (count,).
-    left: Array
-
-    @property
-    def basis(self) -> tuple[Array, Array]:
-        """Orthonormal basis of the linear columns, and the matrix that combines the columns to it."""
-        if not self.linear.shape[1]:
-            return self.linear, np.zeros((0, 0))
-        lengths = np.linalg.norm(self.linear, axis=0)
-        lengths[lengths == 0.0] = 1.0
-        U, s, Vt = np.linalg.svd(self.linear / lengths, full_matrices=False)
-        kept = s > RANK * s[0]
-        return U[:, kept], (Vt[kept] / s[kept, None]).T / lengths[:, None]
-
-    @property
-    def own(self) -> Array:
-        """Least-squares state and offset."""
-        Q, combined = self.basis
-        return np.asarray(combined @ (Q.T @ self.left))
 
 
 @dataclass(frozen=True, eq=False)
 class LoopProblem:
     """Parameters of a plant in a loop: ``theta = (a_1 … a_n, b_0 … b_m, tau)``."""
 
-    #: Record.
-    data: FilterData
-    response: LoopResponse
+    parts: tuple[LoopPart, ...]
     offset: bool
     #: Whether the state at the first sample is estimated, not zero.
     free_state: bool
@@ -92,6 +62,24 @@ class LoopProblem:
     delays: tuple[float, float]
     #: Index of the sampling interval of the delay; None for a fixed delay.
     cell: int | None = None
+    #: Whether errors are innovations for white output noise, or for noise of a model: with an unknown controller.
+    innovations: bool = False
+    noise: ArmaNoise | None = None
+
+    @property
+    def data(self) -> FilterData:
+        """First record; all have its sampling interval."""
+        return self.parts[0].data
+
+    @property
+    def response(self) -> LoopResponse:
+        """Response of the first record."""
+        return self.parts[0].response
+
+    @property
+    def outputs(self) -> Array:
+        """Outputs of all records that enter sums."""
+        return np.concatenate([data.y_used for data, _ in self.parts])
 
     @property
     def size(self) -> int:
@@ -106,7 +94,7 @@ class LoopProblem:
     @property
     def samples(self) -> int:
         """Number of samples in the sums."""
-        return self.data.count
+        return sum(data.count for data, _ in self.parts)
 
     def split(self, theta: Array) -> tuple[Array, Array, float]:
         """Return denominator, numerator and delay [s] of a parameter vector."""
@@ -135,23 +123,36 @@ class LoopProblem:
         return moved
 
     def columns(self, theta: Array, count: int | None = None) -> Columns | None:
-        """Return the signals of parameters with least-squares state and offset; None if they are not finite."""
-        count, use = self.free if count is None else count, self.data.use
-        linear, state = np.ones((self.samples, int(self.offset))), None
+        """Return the signals of parameters with least-squares states and offsets; None if they are not finite."""
+        found = [self._columns_of(part, theta, self.free if count is None else count) for part in self.parts]
+        each = [columns for columns in found if columns is not None]
+        if len(each) < len(found):
+            return None
+        return stacked(each)
+
+    def _columns_of(self, part: LoopPart, theta: Array, count: int) -> Columns | None:
+        (data, response), use = part, part.data.use
+        linear, state = np.ones((data.count, int(self.offset))), None
         with np.errstate(all="ignore"):
+            if self.innovations and not response.radius(theta) < 1.0:
+                return None
             if self.free_state:
-                left = (self.data.y - self.response.rows(theta, 0, self.cell).output)[use]
-                linear = np.column_stack((self.response.free(theta, self.cell)[use], linear))
+                left = (data.y - response.rows(theta, 0, self.cell).output)[use]
+                linear = np.column_stack((response.free(theta, self.cell)[use], linear))
                 if not (np.isfinite(linear).all() and np.isfinite(left).all()):
                     return None
-                state = Columns(np.zeros((0, 0)), linear, left).own[: linear.shape[1] - int(self.offset)]
-            rows = self.response.rows(theta, count, self.cell, state)
+                at_rest = self._whitened(Columns(np.zeros((data.count, 0)), linear, left), theta, response)
+                state = at_rest.own[: linear.shape[1] - int(self.offset)]
+            rows = response.rows(theta, count, self.cell, state)
         if not (np.isfinite(rows.output).all() and np.isfinite(rows.slopes).all()):
             return None
-        left = (self.data.y - rows.output)[use]
+        left = (data.y - rows.output)[use]
         if state is not None:
             left += linear[:, : state.size] @ state
-        return Columns(rows.slopes[use], linear, left)
+        return self._whitened(Columns(rows.slopes[use], linear, left), theta, response)
+
+    def _whitened(self, columns: Columns, theta: Array, response: LoopResponse) -> Columns:
+        return as_innovations(columns, theta, response, self.noise) if self.innovations else columns
 
     def rows(self, theta: Array, count: int | None = None) -> tuple[Array, Array] | None:
         """Return sensitivities and output error at the used samples with least-squares state and offset."""
@@ -170,7 +171,7 @@ class LoopProblem:
         with np.errstate(all="ignore"):
             hessian, gradient = np.zeros((theta.size,) * 2), np.zeros(theta.size)
             hessian[: self.free, : self.free], gradient[: self.free] = psi.T @ psi, psi.T @ eps
-            squared, output = float(eps @ eps), self.data.y_used - eps
+            squared, output = float(eps @ eps), self.outputs - eps
         if not (np.isfinite(hessian).all() and np.isfinite(squared)):
             return inadmissible(theta.size)
         return Equations(hessian, gradient, hessian, squared, float(output @ output))
@@ -195,8 +196,7 @@ class LoopProblem:
         t, n = self.data.t, self.response.poles + self.response.integrators
         cutoffs = np.geomspace(6.0 / (t[-1] - t[0]), 1.5 / float(np.median(np.diff(t))), CUTOFFS)
         filters = [np.asarray(butter(n, cutoff, analog=True)[1], dtype=float) for cutoff in cutoffs]
-        reference = self.response.data
-        behind = [standard_rows(reference, E, np.zeros(1), delay)[:, :n] for E in filters[::2]]
+        behind = [self._filtered([response.data for _, response in self.parts], E, delay)[:, :n] for E in filters[::2]]
         instruments = np.column_stack((*behind, np.ones((self.samples, int(self.offset)))))
         instruments, _ = np.linalg.qr(instruments / np.maximum(np.linalg.norm(instruments, axis=0), 1e-300))
         for E in filters[::every]:
@@ -225,10 +225,14 @@ class LoopProblem:
             return np.concatenate((found.denominator[1 : response.poles + 1], b, [delay]))
         return None
 
+    def _filtered(self, data: Sequence[FilterData], E: Array, delay: float) -> Array:
+        """Return the rows of a filter at the used samples of all records."""
+        return np.concatenate([standard_rows(each, E, np.zeros(1), delay) for each in data])
+
     def _two_stage(self, E: Array, instruments: Array, delay: float) -> Array | None:
         response, n = self.response, self.response.poles + self.response.integrators
         with np.errstate(all="ignore"):
-            rows = standard_rows(self.data, E, np.zeros(1), delay)
+            rows = self._filtered([data for data, _ in self.parts], E, delay)
         u, y = rows[:, :n], rows[:, 2 * n + 1 : 3 * n + 1]
         highest = rows[:, 3 * n + 1] - y[:, ::-1] @ E[1:]
         by_a = -y[:, ::-1][:, : response.poles]
@@ -258,14 +262,7 @@ class LoopProblem:
             more = [self.stable_start(record, delay) for delay in delays]
             starts += [theta for theta in more if theta is not None]
         found = [self._local(start) for start in starts]
-        results = [one for one in found if one is not None]
-        if not results:
-            return None
-        least = min(results, key=lambda one: one.result.equations.squared_error)
-        level = least.result.equations.squared_error * (1.0 + SAME)
-        agree = sum(one.result.equations.squared_error <= level for one in results)
-        evaluations = sum(one.result.iterations for one in results)
-        return least._replace(tried=len(results), agree=agree, iterations=evaluations)
+        return LoopEstimate.least([one for one in found if one is not None])
 
     def _lowest(self, thetas: Iterator[Array], most: int) -> list[Array]:
         """Return the parameters with the lowest distinct squared errors."""
@@ -340,6 +337,22 @@ class LoopEstimate(NamedTuple):
     agree: int = 1
     iterations: int = 0
 
+    @classmethod
+    def least(cls, results: "list[LoopEstimate]") -> "LoopEstimate | None":
+        """Return the lowest minimum, with the statistics of all."""
+        if not results:
+            return None
+        least = min(results, key=lambda one: one.result.equations.squared_error)
+        level = least.result.equations.squared_error * (1.0 + SAME)
+        agree = sum(one.result.equations.squared_error <= level for one in results)
+        evaluations = sum(one.result.iterations for one in results)
+        return least._replace(tried=len(results), agree=agree, iterations=evaluations)
+
+    @property
+    def start(self) -> Array:
+        """Parameters, as a start of another search."""
+        return self.result.theta
+
     @property
     def radius(self) -> float:
         """Largest magnitude of the poles of the loop [-]."""
@@ -347,10 +360,10 @@ class LoopEstimate(NamedTuple):
 
     @property
     def sensitivity(self) -> SensitivityFunction | None:
-        """Filter from the output noise to the output error; None in continuous time, with gaps, or if unstable."""
-        poles, use = self.problem.response.open_and_closed_poles(self.result.theta), self.problem.data.use
-        without_gaps = bool(use[np.argmax(use) :].all())
-        return SensitivityFunction.of(*poles) if poles and without_gaps and self.radius < 1.0 else None
+        """Filter from output noise to output error; None on an irregular clock, with many gaps, or if unstable."""
+        found = self.problem.response.sensitivity(self.result.theta)
+        missing = max(int((~data.use).sum()) for data, _ in self.problem.parts)
+        return SensitivityFunction.of(*found) if found and missing <= MOST_MISSING and self.radius < 1.0 else None
 
     @property
     def status(self) -> Status:

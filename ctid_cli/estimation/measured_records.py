@@ -314,6 +314,10 @@ class MeasuredRecords:
         parts = sensitivities(self.problem, *self.parameters(found), found.delays)
         return [data.y_used - eps for data, (_, eps) in zip(self.problem.records, parts, strict=True)]
 
+    def errors(self, found: Optimum) -> list[Array]:
+        """Return the output errors of an optimum at the used samples of each record."""
+        return [y - x for y, x in zip(self.outputs, self.simulated(found), strict=True)]
+
     def squared_error_at(self, model: SystemModel, delay: float, k: int = 0) -> float:
         """Return the least sum of squared output errors at a given delay of an input, in the basin of a model."""
         delays = delays_of(model)

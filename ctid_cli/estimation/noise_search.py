@@ -6,21 +6,38 @@ loop the information matrix is block-diagonal, so that a few rounds suffice.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import LONG, Begin, Optimum
 from ctid_cli.inference.innovations import NoiseFit, Orders, all_arma, fit_arma, steps_of
+from ctid_cli.signals.noise import ArmaNoise
 
 #: Decrease of ``-2 ln L`` per round that counts as convergence; largest number of rounds.
 SETTLED, MOST_ROUNDS = 1e-6, 40
 
 
+class Whitenable(Protocol):
+    """Records whose errors a noise model whitens, with the minima of their squares; each minimum is a ``start``."""
+
+    def used(self) -> tuple[BoolArray, ...]:
+        """Return the mask of the used samples of each record."""
+
+    def errors(self, found: Any) -> list[Array]:
+        """Return the errors of a minimum at the used samples of each record, not whitened."""
+
+    def whitened_by(self, noise: ArmaNoise) -> "Whitenable":
+        """Return a copy with whitened errors."""
+
+    def local(self, *starts: Any) -> Any:
+        """Return the minimum in the basin of a start."""
+
+
 class JointOptimum(NamedTuple):
     """Plant and noise of the greatest likelihood found."""
 
-    found: Optimum
+    found: Any
     noise: NoiseFit
 
 
@@ -37,7 +54,7 @@ def joint_optimum(
     The output-error optimum may have fitted the noise: the plant is searched again by the innovations under that noise,
     from the starts of the output-error search, and if nested from smaller plants too.
     """
-    joint = _near(measured, found, orders)
+    joint = joint_near(measured, found, orders)
     if not sum(joint.noise.orders):
         return joint
     white, size = measured.whitened_by(joint.noise.noise), found.start[0].size
@@ -51,16 +68,16 @@ def joint_optimum(
     return min((joint, _settled(measured, JointOptimum(other, joint.noise))), key=lambda each: each.noise.deviance)
 
 
-def _near(measured: MeasuredRecords, found: Optimum, orders: Orders | None) -> JointOptimum:
+def joint_near(measured: Whitenable, found: Any, orders: Orders | None) -> JointOptimum:
     """Return plant and noise in the basin of an output-error optimum."""
     steps = [steps_of(use) for use in measured.used()]
     if orders is not None:
-        return _settled(measured, JointOptimum(found, fit_arma(_errors(measured, found), steps, orders)))
+        return _settled(measured, JointOptimum(found, fit_arma(measured.errors(found), steps, orders)))
     fits: dict[Orders, NoiseFit] = {}
     tried: dict[Orders, JointOptimum] = {}
     while True:
         # The output-error fit absorbs part of the noise: repeat with the errors of the joint fit.
-        fits = all_arma(_errors(measured, found), steps, fits)
+        fits = all_arma(measured.errors(found), steps, fits)
         chosen = min(fits.values(), key=lambda fit: fit.bic)
         if chosen.orders in tried:
             return min(tried.values(), key=lambda joint: joint.noise.bic)
@@ -68,16 +85,12 @@ def _near(measured: MeasuredRecords, found: Optimum, orders: Orders | None) -> J
         found = joint.found
 
 
-def _errors(measured: MeasuredRecords, found: Optimum) -> list[Array]:
-    return [y - x for y, x in zip(measured.outputs, measured.simulated(found), strict=True)]
-
-
-def _settled(measured: MeasuredRecords, joint: JointOptimum) -> JointOptimum:
+def _settled(measured: Whitenable, joint: JointOptimum) -> JointOptimum:
     """Estimate plant and noise alternately until the likelihood converges."""
     (found, noise), steps = joint, [steps_of(use) for use in measured.used()]
     for _ in range(MOST_ROUNDS if sum(noise.orders) else 0):
         found = measured.whitened_by(noise.noise).local(found.start)
-        updated = fit_arma(_errors(measured, found), steps, noise.orders, noise)
+        updated = fit_arma(measured.errors(found), steps, noise.orders, noise)
         settled, noise = noise.deviance - updated.deviance < SETTLED, updated
         if settled:
             break

@@ -226,6 +226,8 @@ class Identification(DeferredFields, FittedModel, Shown):
             If ``ahead`` is not a positive integer.
         """
         require_integer("ahead", ahead, 1)
+        if ahead > 1 and isinstance(self.fit, LoopFit) and self.fit.in_ignored_loop:
+            raise DataError("a plant that may be unstable is predicted one sample ahead only")
         applied = self.options._applied(self.fit, self.options.prepare(record).laid_out)
         (use,), errors, found = applied.used, applied.residuals, np.full(record.n_samples, np.nan)
         left = errors if self.fit.noise is None else self.fit.noise.prediction_errors(errors, applied.used, ahead)

@@ -1,4 +1,4 @@
-"""Output-error estimation of a transfer function in a simulated loop with a known controller."""
+"""Estimation of a transfer function, also an unstable one, in a simulated loop."""
 
 from __future__ import annotations
 
@@ -19,27 +19,33 @@ from ctid_cli.estimation.common import (
     checked_bounds,
     quality,
 )
-from ctid_cli.estimation.loop_problem import Columns, LoopEstimate, LoopProblem
+from ctid_cli.estimation.loop_columns import Columns, LoopPart
+from ctid_cli.estimation.loop_problem import LoopEstimate, LoopProblem
 from ctid_cli.estimation.measured_records import AppliedModel
+from ctid_cli.estimation.noise_search import joint_near
 from ctid_cli.estimation.record_preparation import without_means
-from ctid_cli.estimators.measured_fit import FittedSamples, MeasuredFit, Starts
+from ctid_cli.estimation.unknown_controller import UnknownController
+from ctid_cli.estimators.measured_fit import FittedSamples, MeasuredFit, Starts, beside_output_error
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.loop import NO_DELAY
 from ctid_cli.filtering.loop_response import LoopResponse
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.loop_noise import SensitivityFunction
+from ctid_cli.inference.noise_estimate import orders_of
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.controller import ContinuousController, DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import Record, as_records, named
+from ctid_cli.signals.record import Loop, Record, as_records, named
 from ctid_cli.signals.treatment import LossKind
 
 #: Options of the initial state and of the offset of a loop.
 LoopState = Literal["rest", "estimate"]
 LoopOffset = Literal["none", "remove", "estimate"]
+#: Polynomials of a controller.
+SIDES = "numerator", "denominator"
 #: Status values with standard errors.
 DETERMINED = (Status.CONVERGED, Status.DELAY_AT_BOUND)
 
@@ -59,7 +65,8 @@ class LoopFit(MeasuredFit):
     loop_radius : float
         Largest magnitude of the poles of the loop with the controller over one sampling interval [-].
     sensitivity : SensitivityFunction or None
-        Filter from the output noise to the output error; None with a controller in continuous time or missing samples.
+        Filter from the output noise to the output error; None if unknown, with a controller in continuous time or
+        missing samples.
     """
 
     loop_radius: float = float("nan")
@@ -70,15 +77,23 @@ class LoopFit(MeasuredFit):
     ) -> Uncertainty:
         """Return standard errors and intervals for a kind of noise.
 
-        ``auto`` is ``robust``, since the loop colours the noise. There are none if no minimum was reached.
+        ``auto`` is ``robust``, since the loop colours the noise; for innovations, which are white, as in
+        :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`. There are none if no minimum was reached.
         """
+        if self.in_ignored_loop:
+            found = MeasuredFit.uncertainty(self, kind, draws, progress)
+            return found if self.status in DETERMINED else found.undefined
+        psi, errors, loop = self.sensitivities, self.residuals, self.sensitivity
+        if loop is not None:
+            each = zip(psi, errors, self.used, strict=True)
+            psi, errors = zip(*(loop.completed(*one) for one in each), strict=True)
         found = estimate_uncertainty(
-            self.sensitivities,
-            self.residuals,
+            psi,
+            errors,
             "robust" if kind == "auto" else kind,
             draws,
             tangent=self.tangent,
-            loop=self.sensitivity,
+            loop=loop,
             progress=progress,
         )
         return found if self.status in DETERMINED else found.undefined
@@ -86,23 +101,31 @@ class LoopFit(MeasuredFit):
 
 @dataclass(frozen=True, eq=False)
 class LaidOutLoop:
-    """Record in closed loop, prepared for estimation."""
+    """Records in closed loop, prepared for estimation."""
 
-    record: Record
-    problem: LoopProblem
-    #: Subtracted means.
-    input_offset: float
-    offset: float
+    #: Records without the subtracted means, and these means.
+    records: list[Record]
+    problem: LoopProblem | UnknownController
+    input_offsets: tuple[float, ...]
+    offsets: tuple[float, ...]
 
-    @property
-    def records(self) -> list[Record]:
-        """Record without the subtracted means."""
-        return [self.record]
+    def around(self, theta: Array) -> LoopProblem:
+        """Return the problem near parameters."""
+        problem = self.problem
+        if isinstance(problem, LoopProblem):
+            low, high = problem.delays
+            return replace(problem, cell=problem.cell_of(theta[-1])) if low < high else problem
+        found = problem.around(theta)
+        if found is None:
+            raise DataError(
+                "no stable controller is found that stabilises this model; use other poles and zeros, or another delay"
+            )
+        return found
 
 
 @dataclass(frozen=True)
 class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
-    """Output-error estimate in a simulated loop with known reference and controller; the plant may be unstable.
+    """Output-error estimate in a simulated loop; the plant may be unstable.
 
     Parameters
     ----------
@@ -125,6 +148,9 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         controller and no missing samples it is an autoregression filtered by the sensitivity function of the loop.
     bootstrap_draws : int, default 500
         Number of simulated noise sequences of a bootstrap [-].
+    noise_model : str, default "white"
+        ``white``, ``arma:P,Q``, or ``auto`` for the orders up to 3 of least BIC; only for records without reference and
+        controller, where the estimate depends on it.
 
     Raises
     ------
@@ -133,10 +159,17 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
 
     Notes
     -----
-    The cost is ``sum (y - T(theta) r)^2``, with T the simulated loop. The reference is independent of the noise, so
-    that the estimate is consistent for noise of any colour; with white output noise, instruments (CLSRIVC) or the
-    direct method also use the input and are more accurate with strong feedback. Starts are two-stage least squares with
-    filtered references as instruments. The estimate is invalid if the given controller is not that of the record.
+    With a known controller the cost is ``sum (y - T(theta) r)^2``, with T the simulated loop. The reference is
+    independent of the noise, so that the estimate is consistent for noise of any colour; with white output noise,
+    instruments (CLSRIVC) or the direct method also use the input and are more accurate with strong feedback. Starts are
+    two-stage least squares with filtered references as instruments. The estimate is invalid if the given controller is
+    not that of the record.
+
+    For a record without reference and controller, one that stabilises the model is designed, and the loop that it makes
+    of the measured signals is simulated, see :mod:`ctid_cli.estimation.unknown_controller`. The cost is that of the
+    innovations (direct method): the estimate is efficient if the noise model is that of the output noise and there is a
+    sample of delay in the loop, and biased otherwise. The delay must be known, and the clock regular without missing
+    samples.
 
     Examples
     --------
@@ -166,6 +199,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
     integrators: int = 0
     covariance: Covariance = "auto"
     bootstrap_draws: int = DRAWS
+    noise_model: str = "white"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -189,47 +223,100 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
 
     def _lay_out(self, records: Record | Sequence[Record]) -> LaidOutLoop:
         several = as_records(records)
-        if len(several) != 1:
-            raise DataError("a loop is fitted to one record; give one file")
-        loop, where = several[0].loop, named(several[0])
-        if loop is None or loop.controller is None:
-            missing = "neither" if loop is None else "no controller"
-            raise DataError(f"{where}the loop needs the reference and the controller, and this record has {missing}")
-        record, u0, y0 = without_means(several[0]) if self.offset == "remove" else (several[0], [0.0], 0.0)
-        assert record.loop is not None
-        if loop.continuous and self.delay_bounds[1] > 0:
-            raise DataError(f"{where}{NO_DELAY}")
-        if self.delay_bounds[1] > 0:
-            check_greatest_delay(record, self.delay_bounds[1])
-        data = filter_data(record)
-        driven = filter_data(self._acting(record))
-        kind = ContinuousController if loop.continuous else DiscreteController
-        controller = kind(loop.controller.numerator, loop.controller.denominator)
-        at_controller, free = loop.enters == "controller", self.initial_state == "estimate"
-        structure = self.poles, self.zeros, self.integrators
-        response = LoopResponse(driven, controller, at_controller, *structure)
-        check_record(record, driven, self.poles + self.zeros + 2)
-        problem = LoopProblem(data, response, self.offset == "estimate", free, self.delay_bounds)
-        return LaidOutLoop(record, problem, u0[0], y0)
+        if self.offset == "remove":
+            centred = [without_means(record) for record in several]
+        else:
+            centred = [(record, [0.0], 0.0) for record in several]
+        own = [record for record, _, _ in centred]
+        known = self._controller_of(own)
+        for record in own:
+            if self.delay_bounds[1] > 0:
+                check_greatest_delay(record, self.delay_bounds[1])
+            check_record(record, filter_data(self._acting(record)), self.poles + self.zeros + 2)
+        problem = self._unknown(own) if known is None else self._known(own, known)
+        return LaidOutLoop(own, problem, tuple(u0[0] for _, u0, _ in centred), tuple(y0 for _, _, y0 in centred))
+
+    def _controller_of(self, records: Sequence[Record]) -> DiscreteController | ContinuousController | None:
+        """Return the controller of all records; None if it is unknown."""
+        first = records[0].loop
+        for record in records[1:]:
+            if not _same_loop(first, record.loop) or record.interval != records[0].interval:
+                raise DataError(
+                    f"{named(record)}several records in a loop need the same controller and sampling interval, and "
+                    f"those of {records[0].name or 'the first one'} differ; fit them one by one"
+                )
+        if first is None or first.controller is None:
+            return None
+        if first.continuous and self.delay_bounds[1] > 0:
+            raise DataError(f"{named(records[0])}{NO_DELAY}")
+        if self.noise_model != "white":
+            text = "noise_model is for records without controller and reference; use white"
+            raise OptionError("noise_model", text)
+        kind = ContinuousController if first.continuous else DiscreteController
+        return kind(first.controller.numerator, first.controller.denominator)
+
+    @property
+    def _structure(self) -> tuple[int, int, int]:
+        return self.poles, self.zeros, self.integrators
+
+    def _known(self, records: Sequence[Record], controller: DiscreteController | ContinuousController) -> LoopProblem:
+        parts = []
+        for record in records:
+            assert record.loop is not None
+            driven, at_controller = filter_data(self._acting(record)), record.loop.enters == "controller"
+            response = LoopResponse(driven, controller, at_controller, *self._structure)
+            parts.append(LoopPart(filter_data(record), response))
+        return LoopProblem(tuple(parts), self.offset == "estimate", self.initial_state == "estimate", self.delay_bounds)
+
+    def _unknown(self, records: Sequence[Record]) -> UnknownController:
+        for record in records:
+            if record.loop is not None:
+                wrong = "a reference without its controller is not used for a plant that may be unstable"
+                raise DataError(f"{named(record)}{wrong}; give the controller too, or leave the reference out")
+            wanted = "an unknown controller of an unstable plant needs"
+            if not (record.input_on_grid and record.input.hold == "zoh"):
+                held = "an input that is held from sample to sample of a regular clock"
+                raise DataError(f"{named(record)}{wanted} {held}; give the controller (--loop FILE)")
+            if not record.valid.all():
+                complete = "a record without missing samples"
+                raise DataError(
+                    f"{named(record)}{wanted} {complete}; give the controller (--loop FILE), or cut them off"
+                )
+        if self.searched:
+            raise OptionError(
+                "delay_bounds", "delay_bounds must be one known value without the controller, not a range"
+            )
+        offset, free = self.offset == "estimate", self.initial_state == "estimate"
+        return UnknownController(tuple(records), self._structure, self.delay_bounds[0], offset, free)
 
     def _estimate(self, laid_out: LaidOutLoop, start: Start | None) -> LoopFit:
-        found = laid_out.problem.best(laid_out.record)
+        problem = laid_out.problem
+        found = problem.best(laid_out.records[0])
         if found is None:
             raise DataError(
-                f"{named(laid_out.record)}no model that the reference as an instrument leads to makes a loop whose "
+                f"{named(laid_out.records[0])}no model that the reference as an instrument leads to makes a loop whose "
                 "output is finite; use other poles and zeros, another delay, or a longer record"
             )
-        return self._described(laid_out, found)._with_uncertainty(self.covariance, self.bootstrap_draws)
+        fit = self._described(laid_out, found)
+        if self.noise_model != "white" and isinstance(problem, UnknownController):
+            joint = joint_near(problem, found, orders_of(self.noise_model))
+            other = self._described(laid_out, joint.found._replace(tried=found.tried, agree=found.agree))
+            shared = self.order + self.zeros + 1
+            fit = beside_output_error(other, joint.noise, fit, shared, chosen=self.noise_model == "auto")
+        return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
 
     def _described(self, laid_out: LaidOutLoop, found: LoopEstimate) -> LoopFit:
         """Return the fit without its covariance."""
-        problem, theta = found.problem, found.result.theta
-        own = self._columns(problem, theta, 0).own
+        problem, theta, count = found.problem, found.result.theta, len(laid_out.records)
+        unknown = isinstance(laid_out.problem, UnknownController)
+        own = np.reshape(self._columns(problem, theta, 0).own, (count, -1))
+        states = own.shape[1] - int(problem.offset)
         names = Structure(self.order, self.zeros, self.searched).names
-        states = own.size - int(problem.offset)
-        names += tuple(f"x{k}" for k in range(1, states + 1)) + ("offset",) * problem.offset
+        for k in range(count):
+            tail = f"_{k + 1}" if count > 1 else ""
+            names += tuple(f"x{i}{tail}" for i in range(1, states + 1)) + (f"offset{tail}",) * problem.offset
         a, b, delay = problem.split(theta)
-        whole = np.concatenate((a[1:], b, [delay][: int(self.searched)], own))
+        whole = np.concatenate((a[1:], b, [delay][: int(self.searched)], own.ravel()))
         held = [name for k, name in enumerate(names) if self.poles <= k < self.order]
         model = TransferFunction(b, a, delay)
         fit = LoopFit(
@@ -239,23 +326,25 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
             status=found.status,
             iterations=found.iterations,
             theta=whole,
-            initial_states=(own[:states],),
-            offsets=(float(own[-1]) if problem.offset else laid_out.offset,),
-            input_offsets=(laid_out.input_offset,),
+            initial_states=tuple(own[:, :states]),
+            offsets=tuple(own[:, -1].tolist()) if problem.offset else laid_out.offsets,
+            input_offsets=laid_out.input_offsets,
             starts=Starts(found.tried, found.agree),
             known=tuple(held),
-            loop_radius=found.radius,
-            sensitivity=found.sensitivity,
+            loop_radius=np.nan if unknown else found.radius,
+            sensitivity=None if unknown else found.sensitivity,
+            in_ignored_loop=problem.innovations,
             cost=np.nan,
             fit_percent=np.nan,
             r2=np.nan,
             condition_number=np.nan,
             count=problem.samples,
         )
-        samples, tangent = self._signals(fit, problem)
-        psi, eps, y = samples.sensitivities[0] @ tangent, samples.residuals[0], problem.data.y_used
+        samples, tangent = self._signals(fit, replace(problem, noise=None))
+        psi, eps = np.concatenate(samples.sensitivities) @ tangent, np.concatenate(samples.residuals)
         moments = Equations(psi.T @ psi, psi.T @ eps, psi.T @ psi, float(eps @ eps), 0.0)
-        fitness = quality(moments, float(np.sum((y - y.mean()) ** 2)), y.size)
+        outputs = [data.y_used for data, _ in problem.parts]
+        fitness = quality(moments, sum(float(np.sum((y - y.mean()) ** 2)) for y in outputs), eps.size)
         return replace(fit, **samples._asdict(), tangent=tangent, **fitness)
 
     def _columns(self, problem: LoopProblem, theta: Array, count: int | None = None) -> Columns:
@@ -274,8 +363,6 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
     def _signals(self, fit: MeasuredFit, problem: LoopProblem) -> tuple[FittedSamples, Array]:
         """Return the signals of a fit at each used sample, and the free directions of its parameters."""
         theta = self._theta(fit)
-        if self.searched and problem.cell is None:
-            problem = replace(problem, cell=problem.cell_of(theta[-1]))
         columns = self._columns(problem, theta)
         own, size = fit.theta[fit.theta.size - columns.linear.shape[1] :], fit.theta.size
         first, last = self.poles, size - own.size
@@ -287,27 +374,40 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         Q, combined = columns.basis
         tangent = np.zeros((size, len(places) + Q.shape[1]))
         tangent[places, range(len(places))], tangent[last:, len(places) :] = 1.0, combined
-        samples = FittedSamples((columns.left - columns.linear @ own,), (psi,), (problem.data.use,), None)
-        return samples, tangent
+        ends = np.cumsum([data.count for data, _ in problem.parts])[:-1]
+        residuals = tuple(np.split(columns.left - columns.linear @ own, ends))
+        used = tuple(data.use for data, _ in problem.parts)
+        return FittedSamples(residuals, tuple(np.split(psi, ends)), used, None), tangent
 
     # --- diagnostics of a fit --------------------------------------------------------------------------
 
     def _acting(self, record: Record) -> Record:
-        """Return the record with the reference as input, since noise affects the measured input."""
-        assert record.loop is not None
+        """Return the record with the reference as input, if known, since noise affects the measured input."""
+        if record.loop is None:
+            return record
         reference = HeldSignal(record.t, record.loop.reference, record.loop.hold)
         return Record(record.t, record.y, reference, name=record.name)
 
     def _samples(self, fit: MeasuredFit, laid_out: Any) -> FittedSamples:
         """Return the signals of a fit at each used sample, from its parameters."""
-        return self._signals(fit, laid_out.problem)[0]
+        return self._signals(fit, laid_out.around(self._theta(fit)))[0]
 
     def _applied(self, fit: MeasuredFit, laid_out: Any) -> AppliedModel:
         """Return the model in the loop of another record, with the best state and offset for it."""
-        problem = laid_out.problem
-        own = self._columns(problem, self._theta(fit), 0).own
+        theta = self._theta(fit)
+        problem = laid_out.around(theta)
+        own = self._columns(problem, theta, 0).own
         states = own.size - int(problem.offset)
-        moved = replace(fit, theta=np.concatenate((fit.theta[: fit.theta.size - own.size], own)))
+        shared = self.order + self.zeros + 1 + int(self.searched)
+        moved = replace(fit, theta=np.concatenate((fit.theta[:shared], own)))
         samples = self._signals(moved, problem)[0]
-        offset = float(own[-1]) if problem.offset else laid_out.offset
+        offset = float(own[-1]) if problem.offset else laid_out.offsets[0]
         return AppliedModel(samples.residuals, samples.used, (own[:states],), (offset,), samples.sensitivities)
+
+
+def _same_loop(one: Loop | None, other: Loop | None) -> bool:
+    """Return whether two records have the same controller, or the same unknown one."""
+    if one is None or other is None or one.controller is None or other.controller is None:
+        return (one is None) == (other is None) and (one and one.controller) is (other and other.controller)
+    sides = [np.array_equal(getattr(one.controller, side), getattr(other.controller, side)) for side in SIDES]
+    return all(sides) and one.continuous == other.continuous and one.enters == other.enters

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from ctid_cli.estimation.robust_fit import RobustFit
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.inference.criteria import percent_from_r_squared
 from ctid_cli.inference.fit import DeferredFields, Fit, InputFit, Status
+from ctid_cli.inference.innovations import NoiseFit
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_covariance, orders_of
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
@@ -144,7 +145,8 @@ class MeasuredFit(DeferredFields, Fit):
     def _with_uncertainty(self, kind: Covariance, draws: int) -> Self:
         """Return the fit with errors for a kind of noise; singular if it converged but has no covariance."""
         law = self.uncertainty(kind, draws)
-        singular = self.status is Status.CONVERGED and not np.isfinite(law.free_covariance).all()
+        undefined = law.kind != "biased" and not np.isfinite(law.free_covariance).all()
+        singular = self.status is Status.CONVERGED and undefined
         return replace(self, covariance=law.covariance, law=law, status=Status.SINGULAR if singular else self.status)
 
     @property
@@ -262,6 +264,9 @@ class MultiInputFit(MeasuredFit):
         raise UsageError(f"the model has the inputs {inputs}; take one of them, such as fit.of_input(NAME)")
 
 
+AnyMeasuredFit = TypeVar("AnyMeasuredFit", bound=MeasuredFit)
+
+
 class FittedSamples(NamedTuple):
     """Signals of a fit at each used sample of each record."""
 
@@ -344,22 +349,29 @@ def with_noise(
     """Return the maximum-likelihood fit of plant and noise, with an output-error fit for comparison."""
     joint = joint_optimum(measured, found, orders_of(noise_model), starts, nested=nested)
     fit = fitted(measured, replace(joint.found, tried=found.tried, agree=found.agree), output_error.profile, None)
+    shared = measured.layout_of(fit.model).degrees.size
+    return beside_output_error(fit, joint.noise, output_error, shared, chosen=noise_model == "auto")
+
+
+def beside_output_error(
+    fit: AnyMeasuredFit, noise: NoiseFit, output_error: MeasuredFit, shared: int, *, chosen: bool
+) -> AnyMeasuredFit:
+    """Return a fit with its noise, compared with an output-error fit by the leading, shared parameters."""
     law = output_error.uncertainty("robust")
     robust = law.covariance
     with np.errstate(invalid="ignore"):
         errors = np.sqrt(np.diag(robust))
     estimate = NoiseEstimate(
-        noise=joint.noise.noise,
-        covariance=noise_covariance(joint.noise, fit.residuals, fit.used),
-        deviance=joint.noise.deviance,
-        chosen=noise_model == "auto",
+        noise=noise.noise,
+        covariance=noise_covariance(noise, fit.residuals, fit.used),
+        deviance=noise.deviance,
+        chosen=chosen,
         output_error=output_error.theta,
         output_error_errors=errors,
         output_error_fit=output_error.fit_percent,
     )
     fit = replace(fit, noise=estimate)
     efficient = fit.uncertainty("white").covariance
-    shared = measured.layout_of(fit.model).degrees.size
     own = (np.arange(fit.theta.size) < shared) & (errors > 0) & (np.diag(efficient) > 0)
     pair = robust[np.ix_(own, own)], efficient[np.ix_(own, own)]
     test = hausman((output_error.theta - fit.theta)[own], *pair, law.degrees_of_freedom)

@@ -25,6 +25,8 @@ from ctid_cli.signals.record import Controller, Enters
 
 #: Below this fraction of its terms, 1 + (direct loop gain) is rounding.
 NO_GAIN = 1e-12
+#: Weight of the states of a stabilising controller, relative to those of input and output.
+LITTLE = 1e-6
 #: Why a loop in continuous time is not simulated with a delay.
 NO_DELAY = (
     "a loop in continuous time with a delay in it has no finite state; the delay must be 0, or the controller discrete"
@@ -220,6 +222,23 @@ def sampled_poles(sampled: SampledModel, discrete: DiscreteController) -> Comple
     dynamics[:n, :n] += A
     dynamics[n:, n:] += Ac
     return np.asarray(np.linalg.eigvals(dynamics), dtype=complex)
+
+
+def stabilising_controller(plant: TransferFunction, interval: float) -> DiscreteController:
+    """Return a controller that stabilises a sampled plant with little effort: linear quadratic, with an observer.
+
+    Its poles are almost those of the plant, unstable ones reflected.
+    """
+    from scipy.linalg import solve_discrete_are  # slow to import
+    from scipy.signal import ss2tf
+
+    A, B, C, D = sampled_model(plant, interval).state_space()
+    weight, one = LITTLE * np.eye(len(A)), np.eye(1)
+    P, S = solve_discrete_are(A, B, weight, one), solve_discrete_are(A.T, C.T, weight, one)
+    K = np.linalg.solve(one + B.T @ P @ B, B.T @ P @ A)
+    L = np.linalg.solve(one + C @ S @ C.T, C @ S @ A.T).T
+    numerator, denominator = ss2tf(A - B @ K - L @ C + L @ D @ K, L, K, np.zeros((1, 1)))
+    return DiscreteController(numerator[0], denominator)
 
 
 def _realised(controller: Controller) -> DiscreteController:

@@ -56,6 +56,8 @@ class LoopResponse:
     poles: int
     zeros: int
     integrators: int = 0
+    #: Whether the controller is at rest at the first sample in any case.
+    controller_at_rest: bool = False
 
     @property
     def continuous(self) -> bool:
@@ -73,12 +75,16 @@ class LoopResponse:
             # That of the plant is p^(n-1)/A u … 1/A u in seconds, independent of the time unit of its companion form.
             n = self.poles + self.integrators
             state = np.concatenate((state[:n] * self._scale(theta) ** np.arange(1.0, n + 1.0), state[n:]))
+            if self.controller_at_rest:
+                state = np.insert(state, n, np.zeros(self.controller.denominator.size - 1))
         return self._continuous(theta, count, state) if self.continuous else self._discrete(theta, count, cell, state)
 
     def free(self, theta: Array, cell: int | None = None) -> Array:
         """Return the free responses to each entry of the initial state, shape (N, f)."""
         unforced = replace(self, data=self.data._replace(u=np.zeros_like(self.data.u)))
-        size = self.poles + self.integrators + self.controller.denominator.size - 1
+        size = self.poles + self.integrators
+        if not self.controller_at_rest:
+            size += self.controller.denominator.size - 1
         if not self.continuous:
             size += self._sampled(theta, cell).shift
         return np.column_stack([unforced.rows(theta, 0, cell, unit).output for unit in np.eye(size)])
@@ -90,10 +96,19 @@ class LoopResponse:
         interval = self.data.interval or float(np.median(np.diff(self.data.t)))
         return float(np.exp(np.linalg.eigvals(self._whole(theta)[0]).real.max(initial=-np.inf) * interval))
 
-    def open_and_closed_poles(self, theta: Array) -> tuple[ComplexArray, ComplexArray] | None:
-        """Return the sampled poles of plant and discrete controller, and of their loop; None in continuous time."""
+    def sensitivity(self, theta: Array) -> tuple[ComplexArray, ComplexArray] | None:
+        """Return zeros and poles of the sampled sensitivity function; None on an irregular clock.
+
+        With a discrete controller the zeros are the poles of plant and controller. In continuous time the noise is held
+        between the samples, as in simulations, and the loop without noise is ``1 - T`` of a held input.
+        """
         if not isinstance(self.controller, DiscreteController):
-            return None
+            if not self.data.interval:
+                return None
+            F, g, c, d = replace(self, at_controller=True)._whole(theta)
+            transition, from_noise = _held(_Plant(F, g, c, d), self.data.interval)
+            zeros = np.linalg.eigvals(transition + np.outer(from_noise, c) / (1.0 - d))
+            return zeros.astype(complex), np.linalg.eigvals(transition).astype(complex)
         plant = self._sampled(theta, None)
         each = plant.state_space()[0], self.controller.state_space()[0]
         separate = np.concatenate([np.linalg.eigvals(dynamics) for dynamics in each])

@@ -5,7 +5,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
+
+#: Largest number of missing samples of a record that are completed.
+MOST_MISSING = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +53,22 @@ class SensitivityFunction:
         from scipy.signal import sosfilt  # slow to import
 
         return np.asarray(sosfilt(self._sections[1], errors, axis=0))
+
+    def completed(self, columns: Array, errors: Array, used: BoolArray) -> tuple[Array, Array]:
+        """Return columns and errors ``S v`` at all samples from the first used one.
+
+        Missing errors are those with the least ``v'v``, and all are scaled for the degrees of freedom; missing rows of
+        the columns are zero, since these samples are not in the sums.
+        """
+        used = used[np.argmax(used) :]
+        missing = np.flatnonzero(~used)
+        if not missing.size:
+            return columns, errors
+        rows, complete = np.zeros((used.size, columns.shape[1])), np.zeros(used.size)
+        units = np.zeros((used.size, missing.size))
+        rows[used], complete[used], units[missing, range(missing.size)] = columns, errors, 1.0
+        complete[missing] = -np.linalg.lstsq(self.removed(units), self.removed(complete))[0]
+        return rows, complete * np.sqrt(used.size / used.sum())
 
     def transposed(self, columns: Array) -> Array:
         """Return columns g with ``g' v = columns' S v`` for every v."""

@@ -15,7 +15,7 @@ import pandas as pd
 from ctid_cli.errors import StorageError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Identification, Options, models_of
-from ctid_cli.estimators.loop_output_error import LoopOutputError
+from ctid_cli.estimators.loop_output_error import LoopFit, LoopOutputError
 from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
 from ctid_cli.identification.sentences import spelled
@@ -234,7 +234,8 @@ class FitResult(PagedResult):
         fit, criteria, validation, units = self.fitted.fit, self.fitted.criteria, self.fitted.validation, self.units
         yield "fit", f"{number(fit.fit_percent, 5)} % = {FIT_DEFINITION}"
         yield "R2", f"{number(fit.r2, 6)} = {R2_DEFINITION}"
-        yield "", "y measured, x simulated, over the samples used"
+        how = "predicted one sample ahead" if isinstance(fit, LoopFit) and fit.in_ignored_loop else "simulated"
+        yield "", f"y measured, x {how}, over the samples used"
         if fit.noise is not None:
             yield from self._noise(fit.noise)
         if validation is not None:
@@ -328,6 +329,8 @@ def _loop(options: Options, measurement: Measurement) -> Iterator[tuple[str, str
     loop, instruments = measurement.record.loop, getattr(options, "instruments", "open_loop")
     if instruments == "reference":
         yield "loop", f"unknown controller; instruments from the reference r = {measurement.reference}"
+    elif isinstance(options, LoopOutputError) and (loop is None or loop.controller is None):
+        yield "loop", "unknown controller, replaced by one that stabilises the model; innovations"
     elif instruments == "closed_loop" and loop is not None and loop.controller is not None:
         simulated = isinstance(options, LoopOutputError)
         how = "output error of the simulated loop, y - T r" if simulated else "instruments from the noise-free loop"

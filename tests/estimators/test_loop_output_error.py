@@ -143,8 +143,40 @@ def test_output_error_is_noise_filtered_by_the_sensitivity_function():
     np.testing.assert_allclose(
         fit.sensitivity.filtered(v), simulate_loop(fit.model, PI, 0 * v, v, 0.05).x + v, atol=1e-9
     )
-    gap = replace(one, y=np.where(np.arange(600) == 300, np.nan, one.y))
-    assert LoopOutputError(2, 0, (0.0, 0.4)).fit(gap).sensitivity is None
+
+
+def test_output_error_in_continuous_time_is_held_noise_filtered_by_the_sensitivity_function():
+    t, r = 0.1 * np.arange(400), np.random.default_rng(3).standard_normal(400)
+    x = simulate_continuous_loop(STABLE, LEAD, HeldSignal(t, r), 0.0 * r).x
+    fit = LoopOutputError(2, 0).fit(Record(t, x + 0.01 * r[::-1], HeldSignal(t, r), loop=Loop(r, LEAD)))
+    v = np.random.default_rng(2).standard_normal(400)
+    error = simulate_continuous_loop(fit.model, LEAD, HeldSignal(t, 0.0 * v), v).x + v
+    np.testing.assert_allclose(fit.sensitivity.filtered(v) * error[0] / v[0], error, atol=1e-9)
+
+
+def test_missing_output_errors_are_completed_and_not_in_the_sums():
+    one = record(STABLE, PI, noise=0.2, count=1200)
+    whole = LoopOutputError(2, 0).fit(one)
+    used = np.random.default_rng(5).random(1200) > 0.1
+    fit = LoopOutputError(2, 0).fit(replace(one, y=np.where(used, one.y, np.nan)))
+    psi, errors = fit.sensitivity.completed(fit.sensitivities[0], fit.residuals[0], used)
+    assert errors.size == 1200 - int(np.argmax(used))
+    assert not psi[~used[np.argmax(used) :]].any()
+    assert np.std(fit.sensitivity.removed(errors)) == pytest.approx(0.2, rel=0.06)
+    ratios = [fit.standard_errors[name] / whole.standard_errors[name] for name in ("a1", "a2", "b0")]
+    assert ratios == pytest.approx([1 / np.sqrt(0.9)] * 3, rel=0.08)
+
+
+def test_the_same_record_twice_has_its_errors_over_the_root_of_two():
+    one = record(UNSTABLE, PD, noise=0.1, count=800)
+    options = LoopOutputError(2, 0, initial_state="estimate", offset="estimate", covariance="white")
+    once, twice = options.fit(one), options.fit([one, one])
+    assert twice.parameter_names[-8:] == ("x1_1", "x2_1", "x3_1", "offset_1", "x1_2", "x2_2", "x3_2", "offset_2")
+    assert len(twice.initial_states) == len(twice.residuals) == 2
+    for name in ("a1", "a2", "b0"):
+        assert twice.parameters[name] == pytest.approx(once.parameters[name], abs=1e-5)
+        assert twice.standard_errors[name] == pytest.approx(once.standard_errors[name] / np.sqrt(2), rel=0.01)
+    assert twice.parameters["offset_2"] == pytest.approx(once.parameters["offset"], abs=1e-6)
 
 
 def test_integrator_offset_and_state_that_is_not_rest():
@@ -210,14 +242,18 @@ CONTINUOUS = Record(
     *(lambda t: (t, np.cos(t), HeldSignal(t, np.sin(t))))(0.1 * np.arange(50)), loop=Loop(np.ones(50), LEAD)
 )
 REFUSED = {
-    "no loop": (LoopOutputError(1, 0), replace(record(STABLE, PI), loop=None), "has neither"),
-    "no controller": (
+    "a reference alone": (
         LoopOutputError(1, 0),
         replace(record(STABLE, PI), loop=Loop(np.ones(2000), None)),
-        "no controller",
+        "give the controller too",
+    ),
+    "missing samples": (
+        LoopOutputError(1, 0),
+        Record(np.arange(50.0), [np.nan, *np.cos(np.arange(49.0))], HeldSignal(np.arange(50.0), np.arange(50.0))),
+        "without missing samples",
     ),
     "a delay in continuous time": (LoopOutputError(1, 0, (0.1, 0.1)), CONTINUOUS, "the delay must be 0"),
-    "two records": (LoopOutputError(1, 0), [record(STABLE, PI)] * 2, "one record"),
+    "two controllers": (LoopOutputError(1, 0), [record(STABLE, PI), record(STABLE, PD)], "the same controller"),
     "instruments in continuous time": (Srivc(1, 0, instruments="closed_loop"), CONTINUOUS, "loop_output_error"),
 }
 
