@@ -11,7 +11,12 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.estimators.frequency_domain import FrequencyDomain, FrequencyDomainFit
+from ctid_cli.estimators.frequency_domain import (
+    FrequencyDomain,
+    FrequencyDomainFit,
+    FrequencyDomainSum,
+    FrequencyDomainSumFit,
+)
 from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopFit, LoopOutputError
 from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
 from ctid_cli.estimators.measured_submodels import LaidOutSubmodels, MeasuredSubmodels, SubmodelsFit
@@ -41,7 +46,15 @@ from ctid_cli.signals.record import Record, common_samples
 from ctid_cli.text import Shown
 
 #: Estimators of measured records, and their prepared records.
-Options = DelayProfile | Rivc | AdditiveOutputError | MeasuredSubmodels | LoopOutputError | FrequencyDomain
+Options = (
+    DelayProfile
+    | Rivc
+    | AdditiveOutputError
+    | MeasuredSubmodels
+    | LoopOutputError
+    | FrequencyDomain
+    | FrequencyDomainSum
+)
 LaidOut = MeasuredRecords | LaidOutSubmodels | LaidOutLoop
 #: Plot of the cost: number of delays about the estimate, and half-range in half-widths of the interval.
 DRAWN_DELAYS, DRAWN_INTERVALS = 24, 2.5
@@ -77,9 +90,9 @@ class Identification(DeferredFields, FittedModel, Shown):
 
     Parameters
     ----------
-    options : DelayProfile, AdditiveOutputError, MeasuredSubmodels, LoopOutputError or FrequencyDomain
-        Estimator.
-    fit : MeasuredFit, MultiInputFit, SubmodelsFit, LoopFit or FrequencyDomainFit
+    options : Options
+        Estimator, such as a DelayProfile, an AdditiveOutputError or a FrequencyDomainSum.
+    fit : MeasuredFit, MultiInputFit, SubmodelsFit, LoopFit, FrequencyDomainFit or FrequencyDomainSumFit
         Estimate.
     answer : ResponseTest
         Test of the response of the outputs to the inputs; without a response no parameter has a standard error.
@@ -108,7 +121,7 @@ class Identification(DeferredFields, FittedModel, Shown):
     deferred: ClassVar[tuple[str, ...]] = ("records",)
 
     options: Options
-    fit: MeasuredFit | MultiInputFit | SubmodelsFit | LoopFit | FrequencyDomainFit
+    fit: MeasuredFit | MultiInputFit | SubmodelsFit | LoopFit | FrequencyDomainFit | FrequencyDomainSumFit
     answer: ResponseTest
     estimates: tuple[UncertainValue, ...]
     delay_interval: DelayInterval | None
