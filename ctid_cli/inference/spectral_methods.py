@@ -140,10 +140,10 @@ def _notes(used: list[int], base: float, chosen: bool, unresolved: Array, time_u
     if not used:
         return ()
     span = f"{2 * used[0] + 1}" if len(used) == 1 else f"{2 * used[0] + 1} to {2 * used[-1] + 1}"
-    how = "half of the largest number that fits as well as the smallest" if chosen else "as given"
+    how = "half of the largest number that fits as well as the smallest one" if chosen else "as given"
     text = (
-        f"Each estimate is from {span} lines, {base:.4g} rad/{time_unit} apart, {how}; estimates closer than that "
-        "share data."
+        f"Each estimate uses {span} lines, {base:.4g} rad/{time_unit} apart ({how}); neighbouring estimates share "
+        "lines."
     )
     if not unresolved.size:
         return (text,)
