@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar, cast
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperArgument, TyperCommand
 
 from ctid_cli.canonical import plain
 from ctid_cli.cli._options import flag, with_option_groups
@@ -39,8 +39,11 @@ AllowCode = Annotated[
 AllowOutside = Annotated[
     bool, flag("--allow-outside", "Read data files outside the folder of the file.", envvar="CTID_ALLOW_OUTSIDE")
 ]
-Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Worker processes; all processors by default.")]
-Runs = Annotated[int | None, flag("--runs", "Number of data sets per setting, in place of the file's.", min=1)]
+Jobs = Annotated[
+    int | None,
+    typer.Option("--jobs", "-j", min=1, metavar="N", help="Worker processes; all processors by default."),
+]
+Runs = Annotated[int | None, flag("--runs", "Number of data sets per setting, in place of the file's.", "N", min=1)]
 AllowMixed = Annotated[bool, flag("--allow-mixed", "Mix code versions or processors.")]
 Fresh = Annotated[bool, flag("--fresh", "Move older results aside and start anew.")]
 Config = Annotated[Path, typer.Argument(metavar="CONFIG", help="Experiment file (YAML).")]
@@ -54,6 +57,13 @@ _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
 
 class Command(TyperCommand):
     """A command that refuses an option given twice, as only its last value would count."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the help of arguments and options; the names of arguments say what they are, without a type."""
+        for parameter in self.params:
+            if isinstance(parameter, TyperArgument):
+                parameter.display_type_rich = lambda ctx: ""  # type: ignore[method-assign]
+        super().format_options(ctx, formatter)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line."""

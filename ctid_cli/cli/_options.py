@@ -152,7 +152,7 @@ class RecordOptions:
 class FormatOptions:
     """Form of a command's output."""
 
-    format: Annotated[Format, flag("--format", "Output format.")] = "text"
+    format: Annotated[Format, flag("--format", "text, json, md, csv, html or latex.", "FORMAT")] = "text"
     json: Annotated[bool, flag("--json", "Short for --format json.")] = False
 
     @property

@@ -113,7 +113,8 @@ class PlaceOptions:
     ] = False
     allow_mixed: AllowMixed = False
     retry: Annotated[
-        list[Failure] | None, flag("--retry", "Compute stored failures of this kind again; repeatable.")
+        list[Failure] | None,
+        flag("--retry", "Compute failed, timeout, crashed or memory estimates again; repeatable.", "KIND"),
     ] = None
 
     @property
@@ -301,7 +302,7 @@ def accuracy(
     form: FormatOptions,
     out: Out = Path("results"),
 ) -> None:
-    """Compute the standard errors to expect of an experiment.
+    """Compute the expected standard errors of an experiment.
 
     No data are needed.
 
@@ -335,7 +336,7 @@ def init(
     ] = None,
     force: Annotated[bool, flag("--force", "Overwrite files that exist.")] = False,
 ) -> None:
-    """Write commented experiment files to begin with.
+    """Write experiment files with comments, as a start.
 
     They go into the current folder. Each runs unchanged, in seconds, and explains every line.
     """

@@ -41,10 +41,10 @@ def _root(
 ) -> None:
     """Identify continuous-time models with a time delay, and tabulate how often it succeeds.
 
-    `ctid check` and `ctid fit` take a measured record. A YAML file describes one experiment: `ctid init` writes some to
-    begin with, `ctid validate` checks it, `ctid run` computes it (again to resume), `ctid table` prints the
-    percentages. Exit codes: 0 done, 1 internal error, 2 bad input, 3 refused, 4 every estimate failed, 5 stopped early,
-    6 storage error, 7 difference found, 8 machine out of resources, 130 Ctrl-C, 143 terminated.
+    `ctid check` and `ctid fit` take a measured record. A YAML file describes one experiment: `ctid init` writes
+    examples, `ctid validate` checks it, `ctid run` computes it (the same command again resumes), `ctid table` prints
+    the percentages. Exit codes: 0 done, 1 internal error, 2 bad input, 3 refused, 4 every estimate failed, 5 stopped
+    early, 6 storage error, 7 difference found, 8 machine out of resources, 130 Ctrl-C, 143 terminated.
     """
 
 

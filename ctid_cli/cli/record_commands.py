@@ -28,7 +28,7 @@ def check(
     hold: Annotated[AskedHold, flag("--hold", "The input between its samples.")] = "auto",
     strict: Annotated[bool, flag("--strict", "Exit code 7 if there is a PROBLEM.")] = False,
 ) -> None:
-    """State facts on a measured record, and the fit to begin with.
+    """Describe a measured record, and suggest a first fit.
 
     Clock, gaps, input, saturation, outliers; signal-to-noise ratio, response time, delay; offset, drift, start from
     rest and feedback, tested with the response to the input in noise of any colour. Columns are found by their usual

@@ -211,5 +211,5 @@ class _Sentences:
         missed += ["outliers"] * (not parts.outliers) + ["saturation"] * (not self.facts.saturated)
         if missed:
             text = "; ".join(missed)
-            rule = f"tests are at the level of {LEVEL:g}, intervals hold 95 % and may leave out 0 all the same"
-            yield Finding("ok", "not detected", f"{text}. This rules nothing out: {rule}.")
+            rule = f"the tests are at the level of {LEVEL:g}, so that a 95 % interval may exclude 0"
+            yield Finding("ok", "not detected", f"{text}. Small effects may be present: {rule}.")

@@ -64,7 +64,7 @@ def of_state(rest: Candidate, estimated: Candidate, likely: bool) -> str:
             "(--initial-state estimate)."
         )
     best, other = sorted((rest, estimated), key=lambda each: each.criterion)
-    fall = f"the criterion is {other.criterion - best.criterion:.3g} below that of {_state(other.options)}"
+    fall = f"{_lower(best, other)} than if it is {_state(other.options)}"
     return f"State before the record: {_state(best.options)}; {fall}."
 
 
@@ -89,7 +89,7 @@ def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_un
     other = ranking.runner_up("poles", "zeros", "integrators")
     found = []
     if other is not None:
-        found.append(f"Structure: {spelled(best.options)}; {_below(ranking, other, other.name)}.")
+        found.append(f"Structure: {spelled(best.options)}; {_below(ranking, other, spelled(other.options))}.")
     return found + _too_large(ranking) + of_range(delays, given, time_unit)
 
 
@@ -123,4 +123,9 @@ def of_criterion(ranking: Ranking) -> str:
 
 
 def _below(models: Ranking, other: Candidate, name: object) -> str:
-    return f"the criterion is {other.criterion - models.best.criterion:.3g} below that of {name}, the runner-up"
+    return f"{_lower(models.best, other)} than with the runner-up, {name}"
+
+
+def _lower(best: Candidate, other: Candidate) -> str:
+    fall = other.criterion - best.criterion
+    return f"the criterion is {fall:.0f} lower" if fall >= 100 else f"the criterion is {fall:.3g} lower"

@@ -137,7 +137,7 @@ def _measures(row: Mapping[str, Any]) -> list[dict[str, str]]:
 
 def _times(row: Mapping[str, Any]) -> str:
     cpu = row.get("cpu_seconds")
-    return seconds(row["seconds"]) + (f" ({seconds(cpu)} of the processor)" if cpu is not None else "")
+    return seconds(row["seconds"]) + (f" ({seconds(cpu)} of processor time)" if cpu is not None else "")
 
 
 def _settings(content: Mapping[str, Any]) -> list[str]:

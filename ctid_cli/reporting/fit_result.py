@@ -47,8 +47,8 @@ R2_DEFINITION = "1 - ||y - x||^2 / ||y - mean y||^2"
 
 #: Hold of the input, in words.
 HOLDS: dict[Hold, str] = {
-    "zoh": "constant between its samples",
-    "foh": "straight lines between its samples",
+    "zoh": "constant between samples",
+    "foh": "straight lines between samples",
     "band-limited": "without power above the Nyquist frequency",
 }
 #: Treatment of the initial state and the offset, in words.
@@ -258,7 +258,8 @@ class FitResult(PagedResult):
         inputs = len(fractions_of(fit.model))
         for k, test in enumerate(self.fitted.tests):
             number_of = f" {k // inputs + 1}" * (len(fit.residuals) > 1)
-            yield f"{fit.left_over}{number_of}", _tested(test)
+            tested = _tested(test) if k % inputs == 0 else _cross_tested(test)
+            yield f"{fit.left_over}{number_of}" if k % inputs == 0 else "", tested
 
     def search(self) -> Iterator[tuple[str, str]]:
         """Yield the outcome of the search, and the bounds of the admissible models that it met."""
@@ -405,8 +406,12 @@ def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record]
 def _tested(test: ResidualTests) -> str:
     """Return the outcome of the tests of residuals; the warnings suggest remedies."""
     white = "white" if test.white else "not white"
+    return f"{white} ({probability(test.whiteness_p_value)}), {_cross_tested(test)}"
+
+
+def _cross_tested(test: ResidualTests) -> str:
     free = f"{'independent of' if test.uncorrelated else 'dependent on'} the {test.driver}"
-    return f"{white} ({probability(test.whiteness_p_value)}), {free} ({probability(test.cross_p_value)})"
+    return f"{free} ({probability(test.cross_p_value)})"
 
 
 def save_fit(result: Identification, path: str | os.PathLike[str]) -> None:

@@ -29,9 +29,9 @@ ROWS = 12
 #: Mark of a structure that cannot be chosen, and its meaning.
 NO_CANDIDATE = "no"
 ABOUT_NO_CANDIDATE = (
-    "- Not to be chosen (no): the data do not determine the parameters; or a pair is held at the least damping or the "
-    "greatest frequency that is admitted, where it follows this record's noise; or a smaller structure predicts "
-    "held-back blocks of the record far better."
+    "- Structures marked no are excluded: the data do not determine their parameters; or a pair of poles stopped at "
+    "the least damping or the highest frequency that is allowed, and follows this record's noise; or a smaller "
+    "structure predicts held-back blocks of the record far better."
 )
 STRUCTURE = ("poles", "zeros", "integrators")
 #: Columns that identify a sum of second-order submodels.

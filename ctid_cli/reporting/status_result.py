@@ -74,7 +74,7 @@ class StatusResult(Result):
             shown = found.head(LISTED)
             notes = [f"{id}: {reason}" for id, reason in zip(shown["first"], shown["reason"], strict=True) if reason]
             notes += [f"and {len(found) - LISTED} more"] if len(found) > LISTED else []
-            sections.append(Section(frame=shown.drop(columns="reason"), notes=notes))
+            sections += [Section(frame=shown.drop(columns="reason")), Section(notes=notes)]
         if status.left_aside:
             aside = f"{status.left_aside} stored estimates are set aside: the latest run has other settings."
             aside += " To see them, run their specification again; nothing is computed anew."

@@ -38,7 +38,7 @@ from ctid_cli.storage.manifest import is_of_signal
 
 NOT_RUN = "not run"
 RULE = "Estimates that failed count as not converged. 95 %: Wilson interval of the percentage."
-TIME = "Time: median of one estimate, of the processor where that is stored"
+TIME = "Time: median processor time of one estimate, or elapsed time where only that is stored"
 SETTLING = (
     "settling: time until the slowest tone is in the band to stay [s], from the start and after the last step; - is "
     "never, or unknown. rms: root-mean-square error of each tone over the window [rad/s]; medians over the data sets."

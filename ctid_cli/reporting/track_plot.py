@@ -88,7 +88,7 @@ def _draw_frequencies(axes: Any, track: Track, t: Array, tones: list[int], colou
 def _draw_amplitudes(axes: Any, track: Track, t: Array, colours: list[Any]) -> None:
     for k, style in enumerate(ramp(len(colours))):
         parts = track.amplitudes[:, k], track.amplitude_error[:, k], track.valid[:, k]
-        _draw_valid(axes, t, *parts, colours[k], style["linestyle"], label=str(k + 1))
+        _draw_valid(axes, t, *parts, colours[k], style["linestyle"], label=f"tone {k + 1}")
     seen = track.amplitudes[track.valid]
     seen = seen[np.isfinite(seen) & (seen > 0)]
     if seen.size and np.percentile(seen, 95) > LOGARITHMIC * np.percentile(seen, 5):
@@ -162,7 +162,7 @@ def spectra_drawing(left: LeftOver, track: Track, unit: str | None) -> Drawing:
         shown = left.hertz <= top
         hertz, whole, rest = left.hertz[shown], left.signal_spectrum[shown], left.residual_spectrum[shown]
         axes.plot(*outline(hertz, whole), color=LIGHT, linewidth=0.9, label="signal")
-        axes.plot(*outline(hertz, rest), color=DARK, linewidth=0.9, label="what the tones leave")
+        axes.plot(*outline(hertz, rest), color=DARK, linewidth=0.9, label="residual")
         axes.set_yscale("log")
         floor, peak = float(np.median(rest[rest > 0])) if (rest > 0).any() else 1e-9, float(whole.max())
         if peak > 0:

@@ -81,9 +81,11 @@ class TrackResult(PagedResult):
             Column("valid_percent", "valid %", ".4g"),
         )
         counted = f"{count(track.t.size, 'row')}, one every {track.every:.4g} s"
-        note = f"Medians over the valid ones of {counted}; the spread is half the width of the central 68 %: how far a "
-        note += "tone moves."
-        note += " A standard error (±) is that of the mean frequency." if np.isfinite(track.error).any() else ""
+        note = (
+            f"Medians over the valid rows; there are {counted}. The spread, half the width of the central 68 %, shows "
+        )
+        note += "how far a tone moves."
+        note += " ± is the standard error of the mean frequency." if np.isfinite(track.error).any() else ""
         note += " Valid is a share of the rows where the tone is there." if partly else ""
         return [Section.table(rows, columns, notes=[note, *self._changes()])]
 
@@ -127,7 +129,7 @@ class TrackResult(PagedResult):
         drawn = signal_drawing(signal, track)
         yield Chapter("Signal", [Section(drawing=drawn, caption="The signal, and its spectrogram.")])
         left = left_over(signal.samples, signal.interval, track)
-        yield Chapter("What the tones leave", [_left(track, signal, left)])
+        yield Chapter("Residual", [_left(track, signal, left)])
 
     @property
     def shown_signal(self) -> SampledSignal:
@@ -210,7 +212,7 @@ def _left(track: Track, signal: SampledSignal, left: LeftOver | None) -> Section
         f"Spectra are medians over segments of {number(left.segment, 3)} s; a steady tone stands as high as its "
         "amplitude. A line that is left beside a tone may be the tone itself, where it moves faster than its rows.",
     ]
-    caption = "Amplitude spectra of the signal and of what the tones leave"
+    caption = "Amplitude spectra of the signal and of the residual"
     caption += "; triangles mark the lines that are missing." if track.missing else "."
     return Section(notes=notes, drawing=spectra_drawing(left, track, signal.unit), caption=caption)
 

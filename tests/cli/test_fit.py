@@ -7,12 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from scipy.signal import lfilter
 
 from ctid_cli import Record, load_fit
 from ctid_cli.cli import _progress
-from ctid_cli.cli.fit_structure import delay_range
 from tests.cli.records import rows, write
 
 
@@ -89,12 +87,6 @@ def test_several_files_and_a_validation_record(ctid, record, tmp_path):
     assert [item["file"] for item in content["records"]] == [str(record), str(second)]
     assert content["validation"]["file"] == str(third)
     assert content["validation"]["r2"] > 0.99
-
-
-@pytest.mark.parametrize("text", ["3:0", "-1:2", "nan", "0:inf", "0:1:2"])
-def test_a_range_of_delays_is_low_high_and_not_negative(text):
-    with pytest.raises(typer.BadParameter, match="must be LOW:HIGH"):
-        delay_range(text)
 
 
 def test_a_fit_is_announced_on_a_terminal(monkeypatch):

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pandas as pd
-import pytest
 
 from tests.cli.records import write
 
@@ -52,13 +51,3 @@ def test_a_delay_that_is_missing_is_named(ctid, tmp_path):
     response_file(tmp_path)
     found = ctid("fit --poles 1 --json --out", tmp_path / "new", tmp_path / "frf.csv").stdout
     assert json.loads(found)["warnings"][0].startswith("The delay is taken as 0 s: with --delay 0:16 the fit is 9")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [("--input u", "several inputs are fitted from records"), ("--weight inverse", "drop --weight")],
-)
-def test_what_is_not_for_this_frequency_response(ctid, tmp_path, options, message):
-    file = response_file(tmp_path)
-    assert message in ctid(f"fit --poles 1 {options} --out", tmp_path / "new", file, code=2).stderr
-    assert not (tmp_path / "new").exists()

@@ -22,6 +22,8 @@ FILES = {
     "constant.csv": "t,y\n" + "".join(f"{0.1 * k:.1f},4\n" for k in range(50)),
     "weeks.csv": "t [fortnights],y\n0,1\n1,2\n",
     "short.csv": "t [s],u [V],y [mm]\n0,1,0\n0.1,1,1\n0.2,0,1\n",
+    "inputs.csv": "t,u1,u2,u3,y\n" + "".join(f"{k},{k % 3},{k % 7},{1 - k % 3},{k % 5}\n" for k in range(50)),
+    "frf.csv": "frequency [rad/s],real,imaginary,standard_error\n" + "".join(f"{k},1,{-k},1\n" for k in range(1, 30)),
     "empty.csv": "",
     "letters.csv": "t,u,y\n0,1,2\n1,a,3\n",
     "ms.csv": "t [ms],u [V],y [mm]\n" + "".join(f"{k},{k % 3},{k % 5}\n" for k in range(50)),

@@ -90,13 +90,11 @@ def test_a_stopped_run_can_be_resumed(ctid, here, number, code):
 # --- shards -------------------------------------------------------------------------------------------------
 
 
-def test_three_processes_merged_are_one_run(here, snapshot):
-    words = "run tiny.yaml -j 1 -q"
-    for process in (*(start(here, f"{words} --shard {k}/3") for k in (1, 2, 3)), start(here, f"{words} --out alone")):
-        _, errors = process.communicate(timeout=300)
-        assert (process.returncode, errors) == (0, "")
-    merge = start(here, "merge results")
-    assert merge.communicate(timeout=300) == snapshot
+@pytest.mark.usefixtures("without_workers")
+def test_three_shards_merged_are_one_run(ctid, here, snapshot):
+    for words in ("--shard 1/3", "--shard 2/3", "--shard 3/3", "--out alone"):
+        ctid(f"run tiny.yaml -q {words}")
+    assert ctid("merge results").stdout == snapshot
     assert (here / "results/tiny/runs.h5").read_bytes() == (here / "alone/tiny/runs.h5").read_bytes()
 
 

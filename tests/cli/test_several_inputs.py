@@ -4,11 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from ctid_cli import HeldSignal, TransferFunction, simulate
-from ctid_cli.cli.main import app
-from ctid_cli.errors import ExitCode
 
 BOTH = ("--input", "u1", "--input", "u2")
 
@@ -46,27 +43,3 @@ def test_a_model_is_fitted_written_compared_and_exported(ctid, record, tmp_path)
     assert "Response to u2" in (tmp_path / "fit.html").read_text(encoding="utf-8")
     compared = json.loads(ctid("compare", tmp_path / "fit.json", "--on", record, "--json", "--out", tmp_path).stdout)
     assert compared["models"][0]["fit_percent"] == pytest.approx(content["fit_percent"], abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            (*BOTH, "--loop", "unknown", "--poles", 1, "--delay", 0),
-            "is not available for several inputs; give one --input",
-        ),
-        ((*BOTH, "--poles", "u9=1"), "the inputs are u1, u2"),
-        ((*BOTH, "--poles", 1, "--poles", 2), "--poles is given twice"),
-        ((*BOTH, "--poles", "one"), "'--poles': must be a whole number"),
-        ((*BOTH, "--poles", "u1=2", "--poles", "u2=1", "--zeros", "u1=3"), "input u1: zeros must be at most 1"),
-        ((*BOTH, "--poles", 1, "--hold", "u3=foh"), "the inputs are u1, u2"),
-        ((*BOTH, "--poles", 1, "--hold", "u1=auto"), "--hold auto chooses one for all inputs"),
-        (("--input", "u1", "--poles", "u1=1"), "name several with --input"),
-        (("--input", "u1", "--input", "u1"), "cannot be both the input and the input 2"),
-    ],
-)
-def test_what_does_not_go_together_is_refused(record, tmp_path, options, message):
-    done = CliRunner().invoke(app, ["fit", str(record), *map(str, options), "--out", str(tmp_path)])
-    assert done.exit_code == ExitCode.BAD_INPUT
-    assert message in " ".join(done.stderr.split())
-    assert not list(tmp_path.iterdir())

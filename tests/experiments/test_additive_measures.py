@@ -5,8 +5,6 @@ import pandas as pd
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.inference.bounds import limiting_accuracy
-from ctid_cli.models.factoring import unfactored
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
@@ -106,24 +104,6 @@ def test_a_ratio_is_that_of_pairs(plan, tmp_path):
         del stored[key]
     with pytest.raises(UsageError, match="srivc and additive have 1 estimates on the same data sets, too few"):
         mse_ratio(Results(tmp_path, MadeResults(results.manifest, stored)), "srivc", "g2_b0", [1000])
-
-
-def test_theory_is_that_of_each_estimators_own_form(plan):
-    found = variances_of(plan)
-    system = plan.data_cells[0].source.system.sorted()
-    options = {
-        "standard_deviation": 1.0,
-        "innovation_variance": 0.02,
-        "noise_filter": ([1.0], [1.0, -0.5]),
-        "samples": 10**6,
-    }
-    additive = limiting_accuracy(system, 0.05, **options)
-    assert [found["additive"][name] for name in additive.names] == pytest.approx(
-        1e6 * additive.standard_errors**2, rel=1e-9
-    )
-    srivc = limiting_accuracy(unfactored(system), 0.05, zeros=2, **options).factored()
-    assert [found["srivc"][name] for name in srivc.names] == pytest.approx(1e6 * srivc.standard_errors**2, rel=1e-6)
-    assert variances_of(plan, cell=1) == found
 
 
 def test_theory_of_the_published_experiments():

@@ -2,7 +2,6 @@
 
 import csv
 
-import numpy as np
 import pytest
 
 from ctid_cli.reporting.results import Results
@@ -26,66 +25,8 @@ def published(file, overrides=()):
     return load_spec(data_folder("configs") / "additive" / file, overrides)
 
 
-def source_of(file):
-    return build_plan(published(file)).data_cells[0].source
-
-
-@pytest.mark.parametrize("file", ["open_loop.yaml", "coverage_open_loop.yaml"])
-def test_the_open_loop_system_has_the_printed_poles(file):
-    source = source_of(file)
-    poles = [-0.25 + 1.39j, -0.15 + 3.16j, -0.17 + 5.77j, -0.5 + 9.99j]
-    for submodel, pole, gain in zip(source.system.submodels, poles, (3, 0.4, 0.2, 0.05), strict=True):
-        assert sorted(submodel.poles, key=np.imag) == pytest.approx([pole.conjugate(), pole], rel=1e-12)
-        assert submodel.dc_gain == gain
-        assert submodel.numerator.size == 1
-    assert source.noise.autocovariance([0])[0] == pytest.approx(0.02 * (1 + 1.35**2 / (1 - 0.85**2)))
-    assert (source.sampling.interval, source.excitation.standard_deviation) == (0.05, 1.0)
-
-
-@pytest.mark.parametrize("file", ["closed_loop.yaml", "closed_loop_coloured.yaml", "coverage_closed_loop.yaml"])
-def test_the_loop_is_the_printed_one(file):
-    source = source_of(file)
-    assert source.system.theta.tolist() == [0.25, 0.25, 3.0, 0.01, 0.025, 1.0]
-    controller = source.loop.controller
-    z = np.exp(0.3j)
-    gain = np.polyval(controller.numerator, z) / np.polyval(controller.denominator, z)
-    assert gain == pytest.approx(0.0115 + 0.00725 * z / (z - 1) + 0.00454 * (z - 1) / z)
-    assert source.loop.enters == "controller"
-    assert source.loop.reference.standard_deviation == 1.0
-    assert source.noise.autocovariance([0])[0] == pytest.approx(0.01)
-    assert source.sampling.interval == 0.05
-
-
-def test_sizes_runs_and_settings():
-    for file, first, last, count in (("open_loop.yaml", 2000, 100000, 30), ("closed_loop.yaml", 500, 123036, 50)):
-        plan = build_plan(published(file))
-        sizes = [cell.source.sampling.samples for cell in plan.data_cells]
-        assert (sizes[0], sizes[-1], len(sizes), plan.runs) == (first, last, count, 300)
-        assert np.diff(np.log(sizes)) == pytest.approx(np.log(last / first) / (count - 1), rel=0.02)
-        for part in plan.estimators:
-            assert part.estimator.max_iterations == 100
-            assert part.estimator.tolerance <= 1e-7
-        assert [start.spread for start in plan.starts] == [0.05]
-    covering = [build_plan(published(file)) for file in ("coverage_open_loop.yaml", "coverage_closed_loop.yaml")]
-    assert [plan.runs for plan in covering] == [1000, 1000]
-    assert {cell.source.sampling.samples for plan in covering for cell in plan.data_cells} == {20000}
-
-
 def test_every_experiment_has_data_sets_of_its_own():
     assert len({published(file).monte_carlo.seed for file in FILES}) == len(FILES)
-
-
-def test_the_beam_is_the_printed_model_and_says_that_it_is_simulated():
-    plan = build_plan(published("flexible_beam.yaml"))
-    source = plan.data_cells[0].source
-    printed = [0.0024, 0.023, 11.81, 2.33e-5, 1.65e-4, 0.159, 8.59e-7, 1.03e-5, 3.19e-4, 7.55e-7, 3.55e-6, 1.27e-4]
-    begun = [0.001, 0.025, 10, 5e-5, 1.5e-4, 0.2, 8.5e-7, 2e-5, 0.001, 7.5e-7, 5e-6, 0.01]
-    assert source.system.theta.tolist() == pytest.approx(printed, rel=1e-15)
-    assert plan.starts[0].draw(1, 0, None).model.theta.tolist() == pytest.approx(begun, rel=1e-15)
-    assert source.system.delay * 4096 == plan.estimators[0].estimator.delay * 4096 == 4
-    assert source.sampling.interval * 4096 == 1
-    assert source.excitation.frequencies_used / np.pi == pytest.approx(np.arange(1, 1001))
-    assert "SIMULATED" in published("flexible_beam.yaml").text
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from ctid_cli.errors import UsageError
 from ctid_cli.reporting.figures.style import STRIPES, outline, spread
 from ctid_cli.reporting.study import find_study
 from ctid_cli.studies.catalogue import find_figures
@@ -79,22 +78,6 @@ def test_stars_are_drawn_where_the_search_switched(switching):
     assert np.array_equal(y, switching.members.mean(axis=1))
 
 
-@pytest.mark.parametrize(
-    ("case", "poles", "zeros", "bandwidth", "filters", "svf_cutoff"),
-    [(CASE_1, 2, 0, 2.02, 10, 1.0), (CASE_2, 4, 1, 26.85, 15, 25.0)],
-)
-def test_settings_are_the_published_ones(case, poles, zeros, bandwidth, filters, svf_cutoff):
-    estimator, data_set = useful_redundancy.published_search(case, True)
-    assert (estimator.poles, estimator.zeros, estimator.bandwidth) == (poles, zeros, bandwidth)
-    assert (estimator.filters, estimator.beta, estimator.order) == (filters, 10, 10)
-    assert (estimator.svf_cutoff, tuple(estimator.delay_bounds)) == (svf_cutoff, (0, 15))
-    assert data_set.true_model.delay == 8.0
-    noise = data_set.record.y - data_set.record.noise_free
-    assert 10 * np.log10(np.var(data_set.record.noise_free) / np.var(noise)) == pytest.approx(15.0, abs=0.5)
-    quiet = useful_redundancy.published_search(case, False)[1]
-    assert np.array_equal(quiet.record.y, data_set.record.noise_free)
-
-
 def test_names_of_figures():
     assert [str(item.place) for item in find_figures(["2", "useful-redundancy/2", "useful-redundancy/1"])] == [
         "useful_redundancy_figures/figure_2.svg",
@@ -104,21 +87,6 @@ def test_names_of_figures():
     assert (
         [item.number for item in find_figures([])] == list("1234567") == list(find_study("useful-redundancy").figures)
     )
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("9", r"useful-redundancy has no figure 9; it has 1, 2, 3, 4, 5, 6, 7$"),
-        ("useful-redundancy/0", r"useful-redundancy has no figure 0; it has"),
-        ("useful-redundency/2", r"did you mean 'useful-redundancy/2'\? Known: 1, 2"),
-        ("additive/9", r"additive has no figure 9; it has 2, 3, 4, 6$"),
-        ("nonsense", r"'nonsense' is neither a figure nor a study with figures\. Known: 1, "),
-    ],
-)
-def test_unknown_names_are_refused(name, message):
-    with pytest.raises(UsageError, match=message):
-        find_figures(["1", name])
 
 
 def test_labels_keep_their_distance_and_order():

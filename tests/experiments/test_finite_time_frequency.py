@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from ctid_cli import DremFiniteTime, DremGradient
-from ctid_cli.studies.catalogue import read_study
+from ctid_cli.studies.catalogue import find_figures, read_study
 from ctid_cli.studies.claims import check_claims
 from ctid_cli.studies.publishing import published_texts
-from tests.experiments import paper_signals as acceptance
 from tests.reporting.frequency_results import STUDY, run_here
 
 as_printed, claims, figures, measured = (STUDY.module(n) for n in ("as_printed", "claims", "figures", "measures"))
@@ -20,36 +19,6 @@ def test_the_bound_is_that_of_a_single_tone_where_tones_are_far_apart():
     # 24 sigma^2/(A^2 T^2 N) for a long record.
     bound = measured.cramer_rao(np.array([2.0, 3.0]), 20_000, 0.01, 0.1)
     assert bound == pytest.approx([(24 * 0.01 / (200.0**2 * 20_000)) ** 0.5] * 2, rel=0.02)
-
-
-# Specifications ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("name", "signal"), [("two-tones", "A"), ("harmonic", "B"), ("step", "D"), ("recovery", "D")])
-def test_signals_are_those_of_the_acceptance_numbers(name, signal):
-    for cell, jump in zip(STUDY.plan(name).data_cells, (True, False), strict=False):
-        assert cell.swept == ({"phase_at_steps": "jump" if jump else "continuous"} if signal == "D" else {})
-        samples = cell.dataset(0).record.samples
-        expected = acceptance.signal(signal, 0.001, 0.001 * samples.size, jump=jump)
-        assert samples == pytest.approx(expected, abs=1e-9)
-
-
-@pytest.mark.parametrize("name", ["random", "efficiency", "recovery-in-noise"])
-def test_noise_has_the_printed_variance(name):
-    (cell, *_) = STUDY.plan(name).data_cells
-    clean = cell.source.signal.generate(cell.source.sampling.times(np.random.default_rng(0)))
-    noise = cell.dataset(0).record.samples - clean
-    assert np.std(noise) == pytest.approx(acceptance.SIGMA, rel=0.02)
-    assert np.abs(noise).max() <= 0.2 or name == "recovery-in-noise"
-
-
-@pytest.mark.parametrize(("name", "tuning"), [("two-tones", "A"), ("harmonic", "B"), ("random", "C"), ("step", "D")])
-def test_the_delay_estimators_have_the_printed_tuning(name, tuning):
-    parts = {part.name: part.estimator.options for part in STUDY.plan(name).estimators}
-    for kind in ("finite_time", "gradient"):
-        options = parts[kind]
-        assert {key: getattr(options, key) for key in acceptance.TUNING[tuning]} == acceptance.TUNING[tuning]
-        assert (options.initial_frequencies, options.first_row, options.power, options.gated) == ((2, 5), 1, 1, True)
 
 
 def test_experiments_with_noise_have_data_sets_of_their_own():
@@ -89,12 +58,13 @@ one = claims.one
 
 def test_settling_times_are_those_of_a_direct_simulation(study):
     rows = measured.settling(study["two-tones"])
-    y = acceptance.signal("A", 0.01, 60.0)
+    t = 0.01 * np.arange(6000)
+    options = {"tones": 2, "initial_frequencies": (2.0, 5.0), "h": 0.1, "d": 0.13, "epsilon": 100.0, "gamma": 0.005}
     for name, kind in (("finite_time", DremFiniteTime), ("gradient", DremGradient)):
-        track = acceptance.drem(kind, "A").track(y, 0.01)
+        track = kind(**options).track(np.sin(2 * t) + np.cos(3 * t), 0.01)
         row = one(rows, estimator=name)
         for band in measured.BANDS:
-            error = np.abs(track.frequencies - acceptance.TRUTH).max(axis=1)
+            error = np.abs(track.frequencies - [2.0, 3.0]).max(axis=1)
             outside = np.flatnonzero(error >= band)
             assert row[f"within_{band:g}"] == pytest.approx(track.t[outside[-1] + 1])
     assert one(rows, estimator="finite_time")["within_0.001"] == pytest.approx(0.66)
@@ -148,7 +118,7 @@ def test_recovery(study):
 def test_efficiency_is_the_error_of_the_last_estimate_over_the_bound(study):
     row = one(measured.efficiency(study["efficiency"]), estimator="esprit", tone=1)
     last = np.array([r["measures"]["omega_1"] for r in study["efficiency"].stored if r["estimator"] == "esprit"])
-    bound = measured.cramer_rao(acceptance.TRUTH, 4000, 0.005, 0.2 / np.sqrt(3))[0]
+    bound = measured.cramer_rao(np.array([2.0, 3.0]), 4000, 0.005, 0.2 / np.sqrt(3))[0]
     assert row["ratio"] == pytest.approx(np.sqrt(np.mean((last - 2.0) ** 2)) / bound)
     assert row["rmse"] ** 2 == pytest.approx(row["bias"] ** 2 + row["deviation"] ** 2 * 7 / 8)
     biased = one(measured.efficiency(study["efficiency"]), estimator="finite_time", tone=2)
@@ -177,6 +147,23 @@ def test_claims_are_judged_on_stored_runs(study, monkeypatch):
     monkeypatch.setattr(claims, "recovery", lambda _: late[late["estimator"] == "window"])
     missed = [claim for claim in claims.memory_ends(study["recovery"]) if not claim.holds]
     assert [claim.measured for claim in missed] == ["inf", "inf"]
+
+
+def test_the_grey_band_of_a_figure_ends_where_finite_time_is_exact(out, drawn):
+    for number, end in (("1", 0.66), ("2", 4.74), ("3", 3.2), ("4", 3.6)):
+        (item,) = find_figures([f"finite-time-frequency/{number}"])
+        item.svg(out)
+        (band,) = drawn[-1].axes[3].patches
+        assert (band.get_x(), band.get_width()) == pytest.approx((0.0, end))
+
+
+def test_figures_show_every_estimator_and_say_which_is_derived():
+    for name in ("two-tones", "harmonic", "random", "step"):
+        parts = {part.name: part.estimator.options for part in STUDY.plan(name).estimators}
+        shown = {estimator for labels in figures.GROUPS.values() for estimator in labels}
+        assert shown == {estimator for estimator, options in parts.items() if not options.whole_record}
+        derived = {part for part, options in parts.items() if DERIVED in type(options).__doc__}
+        assert derived == set(figures.GROUPS[DERIVED])
 
 
 # Publication ---------------------------------------------------------------------------------------------

@@ -109,20 +109,6 @@ def test_what_an_experiment_has_decides_what_it_shows(results, make_results, est
         kinds_of(make_results({}))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("boxes",), r"no kind of figure 'boxes'; did you mean 'box'\? there are measure"),
-        (("box", "rmse"), "--measure goes with --kind measure, not box"),
-        (("measure", "rmse", ["a1"]), "for one parameter: --measure rmse:a1"),
-        (("box", None, ["a1", "a9"]), "no estimator has the parameter 'a9'; there are a1, a2, b0, delay"),
-    ],
-)
-def test_what_cannot_be_drawn_is_refused_in_a_sentence(results, arguments, message):
-    with pytest.raises(UsageError, match=message):
-        experiment_drawing(results, *arguments)
-
-
 def test_a_name_with_a_dollar_is_no_formula(results):
     for cell in results.manifest["data_cells"]:
         cell["content"]["system"] = {"kind": "own", "truth": {"cost $x": 1.0, "_{$": 2.0}}

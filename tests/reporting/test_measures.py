@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from ctid_cli.errors import UsageError
 from ctid_cli.reporting.measures import default_measures, measure_frame, percentage_frame, records_of
 
 DELAYS = (8.1, 7.9, 8.4)
@@ -95,27 +94,6 @@ def test_real_poles_are_matched_whatever_their_order(make_results, estimate):
         cell["content"]["system"] = system
     values = {row["parameter"]: row["value"] for row in rows_of(results, "bias:poles")}
     assert values == pytest.approx({"pole_1": -0.2, "pole_2": -0.1})
-
-
-def test_what_cannot_be_measured_is_refused_in_a_sentence(results, make_results, estimate):
-    with pytest.raises(UsageError, match=r"no measure 'rsme'; did you mean 'rmse'\? Known: percent, bias"):
-        measure_rows(results, ["bias", "rsme"])
-    for name, sentence in {
-        "rmse:dely": "no parameter of the system; did you mean 'delay'",
-        "cpu:delay": "must not have a parameter; use cpu",
-        "response": "needs a frequency",
-        "response:-1": "needs a frequency",
-        "fresh_fit": r"add 'measures: \[fresh_fit\]' to the specification",
-    }.items():
-        with pytest.raises(UsageError, match=sentence):
-            measure_rows(results, [name])
-    without = make_results({(5.0, "0.0"): [estimate(8.0)]}, success=None)
-    with pytest.raises(UsageError, match=r"percent needs a rule .* no success section; use bias, rmse"):
-        measure_rows(without, ["percent"])
-    for cell in without.manifest["data_cells"]:
-        cell["content"].pop("system")
-    with pytest.raises(UsageError, match=r"bias needs true values.*use percent, failures, cpu"):
-        measure_rows(without, ["bias"])
 
 
 def test_the_specification_sets_the_default(results, make_results):

@@ -54,10 +54,3 @@ def test_each_pair_and_each_estimate_counts_once(results, add_estimator, estimat
     assert [(row["first"], row["second"]) for row in rows] == [("other, zeros 0", "other, zeros 1")] * 5
     with pytest.raises(UsageError, match="existing has no swept option; compare it with another estimator"):
         compare_estimators(results, "existing,existing", tmp_path)
-
-
-def test_estimators_that_are_not_there_are_refused(results, tmp_path):
-    with pytest.raises(UsageError, match=r"takes two estimators, A,B, not 'existing'; there are existing, other"):
-        compare_estimators(results, "existing", tmp_path)
-    with pytest.raises(UsageError, match=r"no estimator 'othr'; did you mean 'other'\? There are existing, other"):
-        compare_estimators(results, "existing,othr", tmp_path)

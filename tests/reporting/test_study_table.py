@@ -2,7 +2,6 @@
 
 import pytest
 
-from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import render_markdown, render_text
 from ctid_cli.reporting.measures import records_of
 from ctid_cli.reporting.study import find_study
@@ -132,12 +131,6 @@ def test_the_whole_study_is_the_default_and_committed_tables_stand_in(tmp_path):
     ours = [row for row in committed.rows if row["method"] != "as_printed"]
     assert all(row["n"] == 100 and row["percent"] is not None for row in ours)
     assert "committed results of " in committed.remarks[0]
-
-
-@pytest.mark.parametrize("name", ["5", "useful-redundancy/0", "quickstrat", "other-study/1"])
-def test_unknown_names_are_refused(tmp_path, name):
-    with pytest.raises(UsageError):
-        build_tables([name], tmp_path)
 
 
 def test_failing_estimates_are_listed_with_what_makes_them_again(mixed):

@@ -7,7 +7,7 @@ import pytest
 from ctid_cli.inference.monte_carlo import wilson_interval
 from ctid_cli.reporting.measures import percentage_frame, records_of, settings_of
 from ctid_cli.reporting.results import differences
-from ctid_cli.reporting.table_result import experiment_table, joined, measure_table, success_sentence
+from ctid_cli.reporting.table_result import experiment_table, joined, measure_table
 from tests.reporting.made_frequencies import frequency_results, of_record, of_track
 
 RANDOM = "uniform(0, 9)"
@@ -143,11 +143,3 @@ def test_estimates_of_frequencies_that_failed_have_no_measures(tmp_path, snapsho
     assert [(row["n"], row["failed"], row["converged"]) for row in rows] == [(3, 2, 1), (1, 1, 0)]
     assert experiment_table(results).summary() == snapshot
     assert [row["n"] for row in records_of(percentage_frame(frequency_results(tmp_path, [None], [])))] == [1, 0]
-
-
-def test_the_rule_of_success_in_words():
-    assert success_sentence({"success": {"band": 0.1, "by": None, "fit_percent": 90}}) == (
-        "percent of the data sets whose frequencies all come to lie within 0.1 rad/s of the true ones, to stay there "
-        "and whose model fits to at least 90 %"
-    )
-    assert success_sentence({}) == "nothing, the specification has no success rule"

@@ -44,7 +44,7 @@ def page_of(followed, name=HOSTILE):
 def test_a_page_says_all_and_needs_nothing_but_itself():
     text = page_of(track())
     page = alone(text)
-    titles = ("Warnings", "Data", "Tones", "Signal", "What the tones leave", "Provenance", "How to cite")
+    titles = ("Warnings", "Data", "Tones", "Signal", "Residual", "Provenance", "How to cite")
     assert all(title in page.text for title in titles)
     assert page.tags["svg"] == 3
     assert page.text.count(HOSTILE) >= 4  # title, line of the record, note, reason

@@ -11,7 +11,6 @@ import pytest
 from ctid_cli.canonical import plain
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.reporting.column_file import frame_bytes, hdf5_bytes
-from ctid_cli.reporting.track_plot import track_drawing
 from ctid_cli.reporting.track_result import TrackResult
 from ctid_cli.signals.sampled_signal import SampledSignal
 from ctid_cli.tones.track import Track
@@ -72,16 +71,3 @@ def test_csv_and_hdf5_hold_the_same(chosen):
         for name in frame.columns.drop(["flags_1", "flags_2"]):
             assert store[name][()] == pytest.approx(frame[name].to_numpy(), nan_ok=True)
         assert store["flags_1"].asstr()[()].tolist() == frame["flags_1"].fillna("").tolist()
-
-
-@pytest.mark.parametrize("tones", [1, 2, 7])
-def test_figure(tones):
-    flags = some_invalid()
-    omega = 2 * np.pi * np.outer(1.0 + 0.01 * np.sin(np.arange(ROWS)), 10.0 * np.arange(1, tones + 1))
-    track = Track.of(0.1 * np.arange(ROWS), omega, flags, 0.1, error=0.01 * omega, amplitudes=1.0 / omega)
-    one, two = (track_drawing(track, 0.0, "Pa", "title").saved() for _ in range(2))
-    assert one == two
-    assert one.startswith(b"<?xml")
-    assert b"#e4e4e4" in one  # the shade of invalid rows
-    plain = Track.of(track.t, omega, np.zeros(ROWS, np.uint16), 0.1, amplitudes=1.0 / omega)
-    assert b"#e4e4e4" not in track_drawing(plain, 0.0, None, "title").saved()
