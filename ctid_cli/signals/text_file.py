@@ -271,9 +271,10 @@ def _numbers(layout: Layout, frame: "DataFrame") -> Array:
     """Return columns as numbers, shape (rows, columns); dates become seconds after the first of the file."""
     import pandas as pd
 
-    for place in set(frame).intersection(layout.origins):
-        dates = pd.to_datetime(frame[place], format="ISO8601", utc=True)
-        frame[place] = (dates - pd.to_datetime(layout.origins[place], utc=True)) / pd.Timedelta("1s")
+    for place, first in layout.origins.items():
+        if place in frame:
+            dates = pd.to_datetime(frame[place], format="ISO8601", utc=True)
+            frame[place] = (dates - pd.to_datetime(first, utc=True)) / pd.Timedelta("1s")
     return frame.to_numpy(float)
 
 
