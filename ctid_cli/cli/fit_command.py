@@ -13,7 +13,8 @@ import typer
 from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwriting, write_files
 from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag
 from ctid_cli.cli._progress import FitProgress
-from ctid_cli.cli.fit_structure import FitOptions, LoopOptions, ModelRequest, as_usage_errors
+from ctid_cli.cli.fit_structure import FitOptions, ModelRequest, as_usage_errors
+from ctid_cli.cli.loop_options import LoopOptions
 from ctid_cli.cli.response_fit import frequency_files, frequency_fit
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Tool
