@@ -60,7 +60,7 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[str]:
         what = f"The output diverges: it grows by a factor of e every {fastest:.2g} {time_unit}, and the input does not"
         return [f"{what}; an unstable plant is not among the models"]
     if fit.status in UNFINISHED:
-        loop = ". In a loop the plant may be unstable: that needs the controller (--loop FILE)"
+        loop = ". In a loop the plant may be unstable: that needs the controller (--loop FILE), or --unstable"
         unfinished = fit.status.value.removesuffix(".")
         return [f"{unfinished}{loop * any(record.loop is not None for record in records)}"]
     detected = found.answer.seen
