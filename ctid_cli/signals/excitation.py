@@ -76,11 +76,23 @@ def clock_instants(sample_times: Array, period: float | None) -> Array:
 
 
 def maximal_length_sequence(stages: int, length: int, state: int) -> NDArray[np.int8]:
-    """Return the output of a maximal-length feedback shift register."""
-    from scipy.signal import max_len_seq
+    """Return the output of a maximal-length feedback shift register.
 
-    first = [(state >> k) & 1 for k in range(stages)]
-    return np.asarray(max_len_seq(stages, first, length, TAPS[stages])[0])
+    It equals ``scipy.signal.max_len_seq``; importing that takes seconds, in every worker process.
+    """
+    taps, found = TAPS[stages], np.zeros(max(length, stages), dtype=np.int8)
+    found[:stages] = [(state >> k) & 1 for k in range(stages)]
+    known, stride = stages, 1
+    while known < length:
+        # x[n] is the sum modulo 2 of x[n - stages + tap] over all taps and 0, and so at every stride that is a power of
+        # two, since squares of polynomials over two elements are those of their terms.
+        if 2 * stride * stages <= known:
+            stride *= 2
+        more = min((stages - max(taps)) * stride, length - known)
+        begins = [known - (stages - tap) * stride for tap in (0, *taps)]
+        found[known : known + more] = np.bitwise_xor.reduce([found[k : k + more] for k in begins])
+        known += more
+    return found[:length]
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import max_len_seq
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals.excitation import Gbn, InputFile, Prbs, Step, Steps, maximal_length_sequence
+from ctid_cli.signals.excitation import TAPS, Gbn, InputFile, Prbs, Step, Steps, maximal_length_sequence
 from ctid_cli.signals.multisine import Multisine
 from ctid_cli.signals.noise import stream
 
@@ -16,6 +17,15 @@ def rng(replicate=0):
 
 
 # --- binary inputs --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stages", TAPS)
+def test_register_is_that_of_scipy(stages):
+    length = min(3 * 2**stages + 7, 3000)
+    for state in (1, 2**stages - 1):
+        first = [(state >> k) & 1 for k in range(stages)]
+        expected, _ = max_len_seq(stages, first, length, TAPS[stages])
+        assert np.array_equal(maximal_length_sequence(stages, length, state), expected)
 
 
 @pytest.mark.parametrize("stages", range(2, 21))
