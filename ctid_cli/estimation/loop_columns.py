@@ -74,16 +74,19 @@ def as_innovations(columns: Columns, theta: Array, response: LoopResponse, noise
     Box-Jenkins model structures*, IEEE Trans. Automatic Control 45 (2000) 137-141).
     """
 
-    def removed(signal: Array, step: Array | float = 0.0) -> Array:
-        found = response.sensitivity(theta + step)
+    def loop_at(near: Array) -> SensitivityFunction:
+        found = response.sensitivity(near)
         assert found is not None
-        return SensitivityFunction.of(*found).removed(signal)
+        return SensitivityFunction.of(*found)
 
+    removed = loop_at(theta).removed
     white = Columns(*(removed(signal) if signal.size else signal for signal in columns))
     left = columns.left - columns.linear @ white.own
     for j in range(white.slopes.shape[1]):
         step = STEP * max(1.0, abs(theta[j])) * np.eye(theta.size)[j]
-        white.slopes[:, j] -= (removed(left, step) - removed(left, -step)) / (2.0 * step[j])
+        white.slopes[:, j] -= (loop_at(theta + step).removed(left) - loop_at(theta - step).removed(left)) / (
+            2.0 * step[j]
+        )
     if noise is None:
         return white
     sampled = SampledNoise(noise, steps_of(np.ones(left.size, dtype=bool)))

@@ -178,7 +178,20 @@ def _laid_out(fit: FrequencyDomainFit, data: FrequencyData) -> MeasuredLines:
 
 
 @dataclass(frozen=True)
-class FrequencyDomain(DelayProfile):
+class _OfLines:
+    """Options of records in time, with their defaults: a frequency response has none of them."""
+
+    initial_state: InitialState = field(init=False, default="rest")
+    offset: Offset = field(init=False, default="none")
+    loss: LossKind = field(init=False, default="squares")
+    covariance: Covariance = field(init=False, default="auto")
+    bootstrap_draws: int = field(init=False, default=DRAWS)
+    input_before: InputBefore = field(init=False, default=None)
+    noise_model: str = field(init=False, default="white")
+
+
+@dataclass(frozen=True)
+class FrequencyDomain(_OfLines, DelayProfile):
     r"""Least squares over frequency, by the search of :class:`~ctid_cli.estimators.delay_profile.DelayProfile`.
 
     Parameters
@@ -212,17 +225,10 @@ class FrequencyDomain(DelayProfile):
     """
 
     delay_bounds: tuple[float, float] = (0.0, 0.0)
-    # Options of records in time, with their defaults: a frequency response has none of them.
-    initial_state: InitialState = field(init=False, default="rest")
-    offset: Offset = field(init=False, default="none")
-    loss: LossKind = field(init=False, default="squares")
+    # These too are for records in time only.
     svf_cutoff: float | None = field(init=False, default=None)
     nested: bool = field(init=False, default=False)
     hold_output: OutputHold = field(init=False, default="foh")
-    covariance: Covariance = field(init=False, default="auto")
-    bootstrap_draws: int = field(init=False, default=DRAWS)
-    input_before: InputBefore = field(init=False, default=None)
-    noise_model: str = field(init=False, default="white")
 
     def prepare(self, record: Any) -> Prepared[MeasuredRecords, MeasuredFit]:
         """Check and prepare a frequency response; a DataError states why estimation is impossible.
@@ -248,7 +254,7 @@ class FrequencyDomain(DelayProfile):
 
 
 @dataclass(frozen=True)
-class FrequencyDomainSum(AdditiveOutputError):  # noqa: N818 - not an exception
+class FrequencyDomainSum(_OfLines, AdditiveOutputError):  # noqa: N818 - not an exception
     """Least squares over frequency for a sum of submodels.
 
     Parameters
@@ -276,15 +282,6 @@ class FrequencyDomainSum(AdditiveOutputError):  # noqa: N818 - not an exception
     >>> {name: round(value, 6) for name, value in fit.parameters.items() if name.startswith("g2")}
     {'g2_a1': 0.1, 'g2_a2': 0.1, 'g2_b0': 1.0}
     """
-
-    # Options of records in time, with their defaults: a frequency response has none of them.
-    initial_state: InitialState = field(init=False, default="rest")
-    offset: Offset = field(init=False, default="none")
-    loss: LossKind = field(init=False, default="squares")
-    covariance: Covariance = field(init=False, default="auto")
-    bootstrap_draws: int = field(init=False, default=DRAWS)
-    input_before: InputBefore = field(init=False, default=None)
-    noise_model: str = field(init=False, default="white")
 
     def prepare(self, record: Any) -> Prepared[MeasuredRecords, MeasuredFit]:
         """Check and prepare a frequency response; a record is prepared for applying a model to it."""

@@ -65,7 +65,7 @@ class LoopFit(MeasuredFit):
     loop_radius : float
         Largest magnitude of the poles of the loop with the controller over one sampling interval [-].
     sensitivity : SensitivityFunction or None
-        Filter from the output noise to the output error; None if unknown, with a controller in continuous time or
+        Filter from the output noise to the output error; None if unknown, on an irregular clock, or with more than 500
         missing samples.
     """
 
@@ -144,8 +144,8 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
     integrators : int, default 0
         Poles at the origin in addition to ``poles``, which may then be 0.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
-        Noise assumed for the standard errors. ``auto`` is ``robust``, since the loop colours the noise: with a discrete
-        controller and no missing samples it is an autoregression filtered by the sensitivity function of the loop.
+        Noise assumed for the standard errors. ``auto`` is ``robust``, since the loop colours the noise: on a
+        regular clock it is an autoregression filtered by the sensitivity function of the loop.
     bootstrap_draws : int, default 500
         Number of simulated noise sequences of a bootstrap [-].
     noise_model : str, default "white"
@@ -293,10 +293,10 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         problem = laid_out.problem
         found = problem.best(laid_out.records[0])
         if found is None:
-            raise DataError(
-                f"{named(laid_out.records[0])}no model that the reference as an instrument leads to makes a loop whose "
-                "output is finite; use other poles and zeros, another delay, or a longer record"
-            )
+            instrument = "input" if isinstance(problem, UnknownController) else "reference"
+            what = f"no model that the {instrument} as an instrument leads to makes a loop whose output is finite"
+            cure = "use other poles and zeros, another delay, or a longer record"
+            raise DataError(f"{named(laid_out.records[0])}{what}; {cure}")
         fit = self._described(laid_out, found)
         if self.noise_model != "white" and isinstance(problem, UnknownController):
             joint = joint_near(problem, found, orders_of(self.noise_model))

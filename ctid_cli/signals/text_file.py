@@ -332,15 +332,10 @@ def _refuse(layout: Layout, places: Sequence[int], error: str) -> NoReturn:
                 commas = "; numbers with decimal commas need another separator, such as the semicolon"
                 raise layout.error(line, there + commas * (layout.separator == ","))
             for place, field in enumerate(_split(written, layout.separator)):
-                if place not in places or field in MISSING:
-                    continue
-                found = f"column {layout.columns[place]!r} holds {quoted(field)}"
-                if place in layout.origins:
-                    if not _is_date(field):
-                        there = layout.origins[place]
-                        raise layout.error(line, f"{found}, which is not a date and a time of day like {there}")
-                elif not number.fullmatch(field):
-                    raise layout.error(line, f"{found}, which is {_instead_of_number(field, layout.decimal)}")
+                is_right = _is_date if place in layout.origins else number.fullmatch
+                if place in places and field not in MISSING and not is_right(field):
+                    found = f"column {layout.columns[place]!r} holds {quoted(field)}"
+                    raise layout.error(line, f"{found}, which is {_instead(field, place, layout)}")
     raise layout.error(layout.first, "the columns cannot be read as numbers; write them with one decimal sign")
 
 
@@ -351,8 +346,11 @@ def _is_date(text: str) -> bool:
     return False
 
 
-def _instead_of_number(text: str, decimal: str) -> str:
-    """Describe the text found in place of a number, with a remedy."""
+def _instead(text: str, place: int, layout: Layout) -> str:
+    """Describe the text found in place of a number or a date, with a remedy."""
+    decimal = layout.decimal
+    if place in layout.origins:
+        return f"not a date and a time of day like {layout.origins[place]}"
     if DATE.search(text):
         return "a date or a time of day; write times as 2024-03-01T12:30:00.5, or as seconds since the first sample"
     if text.startswith(COMMENTS):

@@ -204,6 +204,7 @@ def test_a_validation_record_has_a_state_and_an_offset_of_its_own():
 def test_a_validation_record_does_not_change_the_model():
     other = record_of(TransferFunction([-2.0], [1.0, 1.2, 4.0], 0.23), seed=1)
     alone, validated = (identify(record_of(SECOND), validation=each) for each in (None, other))
+    assert alone.choices == choice_of_second().sentences
     first, *others = validated.warnings
     assert "does not generalise" in first
     assert (validated.choices, validated.options, others) == (alone.choices, alone.options, list(alone.warnings))
