@@ -1,6 +1,7 @@
 """Plants in closed loops, also unstable ones: convergence and errors. Simulated records, known controller.
 
     python benchmarks/bench_loops.py [--runs 17] [--seed 1] [--samples 4000] [--paper 60] [--unknown 60]
+    python benchmarks/bench_loops.py --unknown-controller [--colour .9 --noise-model arma:1,0] [--runs 17] [--seed 1]
     python benchmarks/bench_loops.py --known controller [--records 300] [--length 600] [--snr-db 15] [--seed 1]
 
 With ``--known`` the plant ``4 exp(-.537 s)/(s^2 + 2.8 s + 4)``, sampled every .1 s in a loop with a PI controller, by
@@ -12,7 +13,9 @@ stderr when it is done.
 
 Without it, first 4/(p^2 - 1) in six loops with PD controllers kp (1 + td (1 - q^-1)/h), at two levels of white output
 noise: ``runs`` records of each of the twelve, by ``LoopOutputError``: the number that end CONVERGED with errors, the
-coverage of their intervals, and the number of others with an error. Then two modes in the loop of section 6.2 of A.
+coverage of their intervals, and the number of others with an error. With ``--unknown-controller`` the estimator knows
+neither reference nor controller, and the noise is first-order autoregressive with the coefficient ``--colour``; that is
+all that is printed. Then two modes in the loop of section 6.2 of A.
 González et al., *Identification of additive continuous-time systems in open and closed loop*, Automatica (2025),
 arXiv:2401.01263, with a delay of .12 s that is searched in 0 to .5 s: errors of the delay and of the modes'
 frequencies, compared with CLSRIVC with the known delay. Last the same loop with noise e/(1 - .9 q^-1) of the same
@@ -22,11 +25,13 @@ variance, by the known part of the loop: reference and controller, the reference
 import argparse
 import sys
 from collections import Counter
+from dataclasses import replace
 
 from _timing import cpu
 
 import numpy as np
 from _table import print_errors
+from scipy.signal import lfilter
 
 from ctid_cli import (
     AdditiveModel,
@@ -68,11 +73,12 @@ def looped(plant, law, r, v, interval):
     return Record(t, x + v, HeldSignal(t, u), loop=Loop(r, law))
 
 
-def unstable_record(loop, noise, samples, rng):
+def unstable_record(loop, noise, samples, rng, colour=0.0):
     h, kp, td, hold = loop
     law = DiscreteController.from_pid(kp, 0.0, kp * td / h)
     r = np.repeat(rng.standard_normal(samples // hold), hold)
-    return looped(UNSTABLE, law, r, noise * rng.standard_normal(r.size), h)
+    v = np.sqrt(1.0 - colour**2) * lfilter([1.0], [1.0, -colour], rng.standard_normal(r.size))
+    return looped(UNSTABLE, law, r, noise * v, h)
 
 
 def covered(fit, truth):
@@ -80,21 +86,24 @@ def covered(fit, truth):
     return [abs(fit.parameters[n] - truth[n]) <= fit.quantiles[n] * fit.standard_errors[n] for n in names]
 
 
-def six_loops(runs, samples, seed):
-    truth, estimator = {"a1": 0.0, "a2": -1.0, "b0": 4.0}, LoopOutputError(2, 0)
+def six_loops(runs, samples, seed, unknown=False, noise_model="white", colour=0.0):
+    truth, estimator = {"a1": 0.0, "a2": -1.0, "b0": 4.0}, LoopOutputError(2, 0, noise_model=noise_model)
     print("4/(p^2 - 1)                       converged  other with error  a1, a2, b0 covered [%]  CPU s a record")
-    total, wrong, hits, time = 0, 0, [], 0.0
+    total, wrong, hits, time, scaled = 0, 0, [], 0.0, []
     for noise in (0.02, 0.1):
         for k, loop in enumerate(LOOPS):
             rng, own, others = np.random.default_rng([seed, k, int(1000 * noise)]), [], 0
             spent = 0.0
             for _ in range(runs):
-                record = unstable_record(loop, noise, samples, rng)
+                record = unstable_record(loop, noise, samples, rng, colour)
+                if unknown:
+                    record = replace(record, loop=None, feedback=True)
                 taken, fit = cpu(estimator.fit, record)
                 spent += taken
                 errors = np.array(list(fit.standard_errors.values()))
                 if fit.status is Status.CONVERGED and np.isfinite(errors).all():
                     own.append(covered(fit, truth))
+                    scaled.append([(fit.parameters[n] - value) / fit.standard_errors[n] for n, value in truth.items()])
                 else:
                     others += bool(np.isfinite(errors).any())
             shares = " ".join(f"{100 * share:5.1f}" for share in np.mean(own, axis=0))
@@ -103,6 +112,8 @@ def six_loops(runs, samples, seed):
             total, wrong, hits, time = total + len(own), wrong + others, hits + own, time + spent
     shares = " ".join(f"{100 * share:.1f}" for share in np.mean(hits, axis=0))
     print(f"all: {total} of {12 * runs} converged, {wrong} others with an error, {shares} % covered, {time:.0f} CPU s")
+    bias, scatter = np.mean(scaled, axis=0) * np.sqrt(total), np.std(scaled, axis=0)
+    print(f"bias in Monte Carlo errors {bias.round(2)}, deviation over standard error {scatter.round(2)}")
 
 
 def frequencies(model):
@@ -234,6 +245,8 @@ if __name__ == "__main__":
     parser.add_argument("--known", choices=("controller", "reference", "nothing"))
     parser.add_argument("--snr-db", type=float, default=15.0)
     parser.add_argument("--noise-model", default="arma:2,1")
+    parser.add_argument("--unknown-controller", action="store_true")
+    parser.add_argument("--colour", type=float, default=0.0)
     for name, value in (("records", 300), ("length", 600)):
         parser.add_argument(f"--{name}", type=int, default=value)
     for name, value in (("runs", 17), ("seed", 1), ("samples", 4000), ("paper", 60), ("unknown", 60)):
@@ -241,6 +254,10 @@ if __name__ == "__main__":
     given = parser.parse_args()
     if given.known:
         campaign(given)
+        raise SystemExit
+    if given.unknown_controller:
+        noise_model = given.noise_model if given.colour else "white"
+        six_loops(given.runs, given.samples, given.seed, True, noise_model, given.colour)
         raise SystemExit
     six_loops(given.runs, given.samples, given.seed)
     for count, coloured in ((given.paper, False), (given.unknown, True)):
