@@ -16,6 +16,7 @@ import numpy as np
 
 from ctid_cli import DelayProfile, HeldSignal, Record, TransferFunction, read_record, simulate
 from ctid_cli.errors import CtidError
+from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.remedies import tried_remedies
 
 FAULTS = ("poles", "delay", "integrator", "outliers")
@@ -145,11 +146,6 @@ def fitted_and_tested(options, record):
     return fit, 100 * (1 - np.sqrt(np.mean(error**2)) / record.y.std())
 
 
-def held(record, hold):
-    """Return a record with another hold of its input."""
-    return Record(record.t, record.y, HeldSignal(record.input.t, record.input.values, hold), name=record.name)
-
-
 def remedies_of(record, options):
     """Yield each remedy of a fit with its last quarter before and after."""
     fit, before = fitted_and_tested(options, record)
@@ -157,7 +153,7 @@ def remedies_of(record, options):
     began = time.process_time()
     found = tried_remedies([part], options, fit).remedies
     seconds = time.process_time() - began
-    fits = [before, *(fitted_and_tested(one.options, held(record, one.hold))[1] for one in found)]
+    fits = [before, *(fitted_and_tested(one.options, with_hold(record, one.hold))[1] for one in found)]
     # Each remedy is added to those before it.
     return before, list(zip(found, fits[:-1], fits[1:], strict=True)), seconds
 
