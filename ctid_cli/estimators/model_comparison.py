@@ -183,7 +183,7 @@ def _delays(fit: FittedModel) -> list[float]:
 
 
 def _needs_loop(fit: FittedModel, record: Record) -> bool:
-    """Return whether a model of a loop is compared in it; without the loop a stable plant follows the measured input."""
+    """Return whether a model is compared in a loop; without one a stable plant follows the measured input."""
     if not (isinstance(fit, Identification) and isinstance(fit.options, LoopOutputError)):
         return False
     return record.loop is not None or bool(np.any(fit._estimated().parametric.model.poles.real > 0))
