@@ -9,7 +9,7 @@ from numba.core import event
 
 #: Total time of compilation from which it is announced [s].
 SILENT = 2.0
-ANNOUNCEMENT = "ctid: compiling numerical routines, up to 20 s; this happens once after an installation or an update"
+ANNOUNCEMENT = "ctid: compiling numerical routines, up to 20 s; each once after an installation or an update"
 
 
 class CompilationNotice(event.Listener):

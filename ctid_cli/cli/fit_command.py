@@ -14,7 +14,7 @@ from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwritin
 from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag
 from ctid_cli.cli._progress import FitProgress
 from ctid_cli.cli.fit_structure import FitOptions, ModelRequest, as_usage_errors
-from ctid_cli.cli.loop_options import LoopOptions
+from ctid_cli.cli.loop_options import LoopOptions, without_delay
 from ctid_cli.cli.response_fit import frequency_files, frequency_fit
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Tool
@@ -131,6 +131,8 @@ def _fit_of_records(
         raise UsageError("--predict must be 1 for a plant that may be unstable: later outputs are not predicted")
     hold = "zoh" if request.hold == "auto" else request.hold
     records = columns.read_all(files, assessment.validate, hold, reference=loop.reference).treated(loop.applied)
+    if request.single and request.options.common("delay_bounds") is None:
+        records = records.treated(without_delay)
     assessment.check(noise, {record.name: record.n_samples for record in records.all})
     with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)) as progress:
         draws = assessment.draws | {"progress": progress, "time_unit": records.units.time}

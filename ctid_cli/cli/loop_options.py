@@ -22,6 +22,12 @@ DIRECT = (
     "model is (white noise of the output, or that of --noise), if there is a delay of a sample in the loop, and if the "
     "plant is stable or --unstable is given."
 )
+NO_DELAY = "The delay was taken as 0, because --delay is not given."
+
+
+def without_delay(measured: Measurement) -> Measurement:
+    """Return a measurement with a note that its delay was not given."""
+    return replace(measured, notes=(*measured.notes, NO_DELAY))
 
 
 @dataclass(frozen=True)

@@ -137,8 +137,7 @@ def _applied(fit: FittedModel, record: Record, initial_state: InitialState | Non
     if delay >= span:
         text = f"the record ends {span:.6g} after its first input, before the model's delay of {delay:.6g} has passed"
         raise DataError(f"{named(record)}{text}")
-    in_loop = isinstance(fit, Identification) and isinstance(fit.options, LoopOutputError)
-    if (state, shift) == ("rest", "none") and not in_loop:
+    if (state, shift) == ("rest", "none") and not _needs_loop(fit, record):
         use: BoolArray = record.valid & (record.t >= record.input.t[0])
         residuals = (record.y - parametric.simulated(record.input, record.t))[use]
         return _Applied(state, shift, use, residuals, parametric.output_slopes(record.input, record.t)[use])
@@ -183,13 +182,23 @@ def _delays(fit: FittedModel) -> list[float]:
     return [fit._estimated().parametric.model.delay]
 
 
+def _needs_loop(fit: FittedModel, record: Record) -> bool:
+    """Return whether a model is compared in a loop; without one a stable plant follows the measured input."""
+    if not (isinstance(fit, Identification) and isinstance(fit.options, LoopOutputError)):
+        return False
+    return record.loop is not None or bool(np.any(fit._estimated().parametric.model.poles.real > 0))
+
+
 def _treated(
     fit: FittedModel, parametric: Parametric | None, record: Record, state: InitialState, shift: Offset
 ) -> AppliedModel:
     """Return the model with its best initial state and offset, by its estimator or as one fraction."""
-    if isinstance(fit, Identification):
+    looped = isinstance(fit, Identification) and isinstance(fit.options, LoopOutputError)
+    if isinstance(fit, Identification) and (not looped or _needs_loop(fit, record)):
+        treated: dict[str, Any] = {"initial_state": state, "offset": shift}
+        if looped and record.loop is None:
+            treated["delay_bounds"] = tuple(2 * _delays(fit))
         try:
-            treated: dict[str, Any] = {"initial_state": state, "offset": shift}
             options = replace(fit.options, **treated)
         except ValueError as error:
             raise UsageError(str(error)) from None

@@ -89,7 +89,10 @@ def identify(
     choice = choose(several, given, time_unit)
     if given.poles is None and not choice.has_model:
         what = "number of poles (--poles)" if given.modes is None else "submodels (--terms)"
-        raise DataError(f"{choice.why_no_model} Give the {what} to fit a model all the same.")
+        raise DataError(
+            f"{choice.why_no_model} Input and output may be exchanged; else give the {what} to fit a model "
+            "all the same."
+        )
     other = None if validation is None else with_hold(validation, choice.records[0].hold)
     if other is not None:
         # Checked before the fit, which takes longer.

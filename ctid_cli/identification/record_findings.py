@@ -104,7 +104,7 @@ class _Sentences:
         f = self.facts
         if f.input_kind == "constant":
             text = f"The input is constant at {self.u(f.input_low)}: it shows no response"
-            remedy = "where it was at another level before the record, type that level (ctid fit --input-before VALUE)"
+            remedy = "if it was at another level before the record, give that level (ctid fit --input-before VALUE)"
             return Finding("problem", "input", f"{text}; {remedy}.")
         if f.input_kind == "steps":
             times = "once" if f.input_changes == 1 else f"{f.input_changes} times"
@@ -205,7 +205,7 @@ class _Sentences:
                 missed.append(f"{topic} {size}")
         p = probability(parts.feedback_p_value)
         if parts.feedback_p_value <= LEVEL:
-            yield Finding("warning", "feedback", f"The input goes with the noise of the output, as in a loop ({p}).")
+            yield Finding("warning", "feedback", f"The input follows the noise of the output, as in a loop ({p}).")
         else:
             missed.append(f"feedback ({p})")
         missed += ["outliers"] * (not parts.outliers) + ["saturation"] * (not self.facts.saturated)

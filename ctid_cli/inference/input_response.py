@@ -37,7 +37,7 @@ FIRST_ORDER = 12.7
 SIGNIFICANT, SIGNIFICANT_FRACTION = 5.0, 0.3
 #: Number of standard deviations above which a response may already have begun.
 POSSIBLE = 3.0
-#: An input counts as periodic if its autocorrelation exceeds this.
+#: Delays are searched within one period of an input whose autocorrelation exceeds this.
 PERIODIC = 0.3
 
 
@@ -68,15 +68,13 @@ class DelayHint:
 
 @dataclass(frozen=True)
 class InputResponse:
-    """Bandwidth, input band, delay and period of a record."""
+    """Bandwidth, input band and delay of a record."""
 
     #: Frequency below which 95 % of the response lies [rad/s]; the Nyquist frequency if no response is detected.
     bandwidth: float
     #: Frequencies between which 95 % of the power of the input lies [rad/s].
     input_band: tuple[float, float] = (math.nan, math.nan)
     delay: DelayHint | None = None
-    #: Period of the input [s]; NaN if it is not periodic.
-    period: float = math.nan
 
 
 def output_bandwidth(record: Record) -> float:
@@ -115,8 +113,7 @@ def analyse_response(record: Record, moves: InputMoves | None = None) -> InputRe
     bandwidths = best.bandwidths
     if math.isnan(bandwidth):
         bandwidth, bandwidths = nyquist, (nyquist,)
-    timing = _delay_and_period(grid, bandwidths, moves)
-    return InputResponse(min(bandwidth, nyquist), best.input_band, *timing)
+    return InputResponse(min(bandwidth, nyquist), best.input_band, _delay(grid, bandwidths, moves))
 
 
 def regular_grid(record: Record) -> Grid:
@@ -248,8 +245,8 @@ def _filtered(x: Array, coefficients: Array) -> Array:
     return np.asarray(np.fft.irfft(np.fft.rfft(x, n) * np.fft.rfft(coefficients, n), n)[: x.size], dtype=float)
 
 
-def _delay_and_period(grid: Grid, bandwidths: tuple[float, ...], moves: InputMoves) -> tuple[DelayHint | None, float]:
-    """Return the delay, and the period of the input.
+def _delay(grid: Grid, bandwidths: tuple[float, ...], moves: InputMoves) -> DelayHint | None:
+    """Return the delay; None if none is detected.
 
     The correlation of the prewhitened input with the equally filtered output estimates the impulse response. There is
     no response at negative lags, which therefore show the level under the null hypothesis.
@@ -265,7 +262,7 @@ def _delay_and_period(grid: Grid, bandwidths: tuple[float, ...], moves: InputMov
         y = np.where(gaps, 0.0, y)
     power = math.sqrt(float(np.mean(u**2) * np.mean(y**2)))
     if power == 0.0:
-        return None, math.nan
+        return None
     autocorrelation = _cross_correlation(u, u, n // 2)[n // 2 :] / float(np.mean(u**2))
     repeated = np.flatnonzero(autocorrelation[4 * hold :] > PERIODIC)
     # The response to a periodic input is periodic: all lags within one period contain it, or its tail.
@@ -276,12 +273,11 @@ def _delay_and_period(grid: Grid, bandwidths: tuple[float, ...], moves: InputMov
     slowest = math.pi / (4 * min(bandwidths) * h)
     smoothed = list(_smoothed_correlations(r, longest, slowest, reference, 4 if period else 1))
     if not smoothed:
-        return None, period * h or math.nan
+        return None
     # The least smoothed correlation that is clearly significant, else the most significant one.
     strongest = max(smoothed, key=lambda each: each.strength)
     found = next((s for s in smoothed if s.strength > max(2 * SIGNIFICANT, 0.5 * strongest.strength)), strongest)
-    hint = found.onset(4 * math.ceil(slowest), h) if found.strength >= SIGNIFICANT else None
-    return hint, period * h or math.nan
+    return found.onset(4 * math.ceil(slowest), h) if found.strength >= SIGNIFICANT else None
 
 
 def _smoothed_correlations(

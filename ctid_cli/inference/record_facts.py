@@ -21,6 +21,7 @@ from ctid_cli.inference.response_model import Signals, fit_response
 from ctid_cli.inference.response_test import LEVEL as NO_RESPONSE
 from ctid_cli.inference.response_test import response_test
 from ctid_cli.inference.signal_features import InputMoves, growth_time, input_moves, outliers, quantum, saturated
+from ctid_cli.inference.spectral_methods import find_period
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
@@ -163,7 +164,7 @@ def record_facts(record: Record) -> RecordFacts:
         input_levels=moves.levels,
         input_changes=int(moves.changes.size),
         shortest_hold=moves.shortest_hold,
-        input_period=response.period,
+        input_period=_input_period(record),
         excitation_order=excitation_order(record, moves, response),
         input_band=response.input_band,
         output_quantum=quantum(present),
@@ -246,14 +247,25 @@ def _gross(y: Array) -> IntArray:
     return far
 
 
+def _sampled_input(record: Record) -> tuple[float, Array]:
+    """Return the interval of a regular grid, and the input on it."""
+    grid = regular_grid(record)
+    return grid.interval, record.input.at(record.t[0] + grid.interval * (np.arange(grid.u.size) + 1e-6))
+
+
+def _input_period(record: Record) -> float:
+    """Return the period of the input; NaN if it does not repeat itself."""
+    interval, u = _sampled_input(record)
+    return interval * (find_period(u) or math.nan)
+
+
 def excitation_order(record: Record, moves: InputMoves, response: InputResponse) -> int:
     """Return the order of persistent excitation, at most 50: the rank of the autocovariance of the input to -40 dB."""
-    grid = regular_grid(record)
-    u = record.input.at(record.t[0] + grid.interval * (np.arange(grid.u.size) + 1e-6))
+    interval, u = _sampled_input(record)
     highest = response.input_band[1]
     if moves.kind == "continuous" and highest > 0:
         # Neighbouring samples of a slow input are nearly equal: subsample it according to its bandwidth.
-        u = u[:: max(1, int(math.pi / (1.5 * highest * grid.interval)))]
+        u = u[:: max(1, int(math.pi / (1.5 * highest * interval)))]
     order = min(HIGHEST_ORDER, u.size // 3)
     if order < 1 or moves.kind == "constant":
         return 0

@@ -13,6 +13,8 @@ from ctid_cli.signals.table import Role, split_header
 #: Placeholders of unknown units of input and output.
 INPUT, OUTPUT = "in", "out"
 UNKNOWN = {INPUT, OUTPUT}
+#: Units of several factors, which a division encloses in parentheses.
+COMPOUND = re.compile(r"[/*·\s]")
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,8 @@ class Units:
     @property
     def gain(self) -> str:
         """Unit of a static gain."""
-        return f"{self.output}/{self.input}"
+        divisor = f"({self.input})" if COMPOUND.search(self.input) else self.input
+        return f"{self.output}/{divisor}"
 
     def label(self, name: str, unit: str) -> str:
         """Return a name with its unit in brackets, if known."""
@@ -62,7 +65,7 @@ class Units:
     @property
     def square(self) -> str:
         """Unit of a squared output."""
-        return f"({self.output})^2"
+        return f"{self.output}^2" if self.output.isalpha() else f"({self.output})^2"
 
     @property
     def seconds(self) -> float | None:

@@ -365,15 +365,21 @@ def _before(result: Identification) -> str:
     before, state = getattr(result.options, "input_before", None), f"--initial-state {result.options.initial_state}"
     if before is None:
         return f" ({state})"
-    levels = ", ".join(f"{level:.6g}" for level in result.fit.input_offsets)
+    levels = _levels_before(result)
     typed = before if before == "first" else f"{before:g}"
     return f", with the input at {levels} ({state} --input-before {typed})"
+
+
+def _levels_before(result: Identification) -> str:
+    return ", ".join(f"{level:.6g}" for level in result.fit.input_offsets)
 
 
 def _offset(result: Identification, units: Units) -> str:
     fit, options = result.fit, result.options
     if options.offset != "remove":
-        return TREATMENTS[options.offset]
+        from_rest = options.offset == "estimate" and getattr(options, "input_before", None) is not None
+        told = f"; it is the output at rest with the input at {_levels_before(result)}" * from_rest
+        return f"{TREATMENTS[options.offset]}{told}"
     count_of = len(fit.input_offsets) // len(fit.offsets)
     each = [fit.input_offsets[k : k + count_of] for k in range(0, len(fit.input_offsets), count_of)]
     means = []

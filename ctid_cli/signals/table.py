@@ -153,7 +153,15 @@ class Table:
         found = self.read(list(used.values()))
         values = {role: found.values[name] for role, name in used.items()}
         columns = Columns(found.rows, values, chosen, (*self.notes, *found.notes, *notes))
-        return columns if without_times else columns.timed()
+        if without_times:
+            return columns
+        try:
+            return columns.timed()
+        except DataError as error:
+            if wanted["time"] is not None or self._called(USUAL_NAMES["time"], {}):
+                raise
+            guess = f"{chosen['time']!r} was taken as the time by its position"
+            raise DataError(f"{error}. {guess}; if it is not, name the right one (option time, --time NAME)") from None
 
     def _choose(self, wanted: Mapping[str, str | None], optional: str) -> tuple[dict[str, str], list[str]]:
         """Return the column of each role, and the assumptions made."""
@@ -167,7 +175,9 @@ class Table:
             matching = self._called(USUAL_NAMES[role], chosen)
             if len(matching) > 1 and role != optional:
                 several = listed(map(repr, matching))
-                raise DataError(f"{self.head}: {several} may all be the {role}; say which one (option {role})")
+                raise DataError(
+                    f"{self.head}: {several} may all be the {role}; say which one (option {role}, --{role} NAME)"
+                )
             if matching:
                 chosen[role] = matching[0]
         if missing := [role for role in roles if role not in chosen and role != optional]:
@@ -224,7 +234,7 @@ class Table:
         other = "other " if self._called(USUAL_NAMES[role], {}) else ""
         close = next((match for name in USUAL_NAMES[role][1:] if (match := closest(name, left))), None)
         found = f"no {other}{self.noun} is called {usual}; {self._listing}"
-        return self._error(f"{found}. Say which one is the {role} (option {role})", close)
+        return self._error(f"{found}. Say which one is the {role} (option {role}, --{role} NAME)", close)
 
     def _error(self, problem: str, close: str | None) -> DataError:
         """Return the error about a column that is not found."""

@@ -513,7 +513,14 @@ def _of_warnings(estimator: Any, signal: Any, sampling: Any) -> Iterator[Violati
         yield ("estimator", name), text
 
 
+def _of_loose_rules(success: Any) -> Iterator[Violation]:
+    for rule in ("delay_relative_error", "parameter_relative_error"):
+        value = getattr(success, rule)
+        if value is not None and value >= 1.0:
+            yield ("success", rule), f"{value:g} is {100 * value:g} %; {value:g} % is {value / 100:g}"
+
+
 WARNINGS = (
     *(_of_runs, _of_slow_sampling, _of_short_record, _of_cancellation),
-    *(_of_white_formula, _of_whole_record, _of_warnings),
+    *(_of_white_formula, _of_whole_record, _of_warnings, _of_loose_rules),
 )

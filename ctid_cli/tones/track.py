@@ -322,7 +322,7 @@ def _counted(found: int, count: int, tones: int | None) -> Iterator[str]:
     """Yield a sentence on the number of tones and how it was determined."""
     if tones is None:
         more = f" The strongest {count} of {found} are followed." if found > count else ""
-        how = "lines join until the whitened residual shows none, and stay if they are worth their numbers"
+        how = "lines are added until the whitened residual shows none, and kept if they justify their parameters"
         yield f"Tones: {count}, from the record ({how}: minimum description length).{more}"
 
 

@@ -1,9 +1,15 @@
 """Models on the same samples of one record."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from ctid_cli import DelayProfile, Record, compare, identify
+from ctid_cli.estimators.loop_output_error import LoopOutputError
 from tests.cli.records import rows
+from tests.estimators.test_loop_output_error import PD, PI, STABLE, UNSTABLE
+from tests.estimators.test_loop_output_error import record as record_in_loop
 
 
 def test_models_are_compared_with_one_treatment():
@@ -21,3 +27,17 @@ def test_models_are_compared_with_one_treatment():
     assert (states[0].t == states[1].t).all()
     gaps = Record(other.t, np.where(other.t == 2.0, np.nan, other.y), other.input)
     assert compare(fits, gaps)[0].count == other.n_samples - 1
+
+
+@pytest.mark.parametrize("state", ["rest", "estimate"])
+def test_stable_plant_of_a_loop_is_compared_on_a_record_without_its_loop(state):
+    fit = identify([record_in_loop(STABLE, PI, count=600)], LoopOutputError(2, 0, (0.0, 0.4), initial_state=state))
+    other = replace(record_in_loop(STABLE, PI, count=600, seed=2), loop=None)
+    plain = compare([DelayProfile(2, 0, (0.0, 0.4)).fit(other)], other)[0]
+    assert compare([fit], other)[0].rms == pytest.approx(plain.rms, rel=0.02)
+
+
+def test_unstable_plant_of_a_loop_is_compared_by_innovations_on_a_record_without_its_loop():
+    fit = identify([record_in_loop(UNSTABLE, PD, noise=0.02)], LoopOutputError(2, 0, (0.0, 0.4)))
+    other = replace(record_in_loop(UNSTABLE, PD, noise=0.02, seed=2), loop=None)
+    assert compare([fit], other)[0].rms < 0.1

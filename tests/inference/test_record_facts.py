@@ -1,5 +1,6 @@
 """Facts about a record: each planted fault is found, none on a clean record, and estimates are near the true values."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -129,6 +130,8 @@ def test_gaps_and_periods():
     keep = np.r_[0:300, 400:600]
     x = simulate(FIRST_ORDER, HeldSignal(t, u), t)
     assert record_facts(Record.from_arrays(t, u, x)).input_period == pytest.approx(10.0)
+    levels = np.repeat(np.random.default_rng(11).uniform(0.5, 1.5, 15), 40)
+    assert math.isnan(record_facts(Record.from_arrays(t, levels, np.sin(t))).input_period)
     (gap,) = record_facts(Record.from_arrays(t[keep], u[keep], x[keep])).gaps
     assert (gap.start, gap.length) == (pytest.approx(29.9), pytest.approx(10.1))
 

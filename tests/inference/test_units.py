@@ -25,6 +25,12 @@ def test_submodels_whose_denominators_end_in_one():
     assert {name: Units("s", "V", "mm").in_sum(name, model) for name in units} == units
 
 
+def test_a_divisor_of_several_factors_is_in_parentheses():
+    tank = Units("s", "l/s", "m")
+    assert (tank.gain, tank.of("b0", 1, 0), tank.square) == ("m/(l/s)", "m/(l/s)/s", "m^2")
+    assert (Units(output="1/min").gain, Units(output="1/min").square) == ("1/min/in", "(1/min)^2")
+
+
 def test_what_is_not_known_is_no_bracket():
     half = Units(output="mm")
     assert (half.label("y", half.output), half.label("gain", half.gain), half.amount("2", half.input)) == (

@@ -57,8 +57,8 @@ TOGETHER = "which is a number with a decimal point, unlike the first 50 lines; w
 NAMES = "The first line that is no comment must name the columns, separated by commas, semicolons, tabs or blanks"
 THREE = f"and nothing else; a record needs a time, an input and an output. {NAMES}"
 FOUR = "'t', 'a', 'b', 'c'"
-ONE = "; say which one (option time)"
-WHICH = ". Say which one is the input (option input)"
+ONE = "; say which one (option time, --time NAME)"
+WHICH = ". Say which one is the input (option input, --input NAME)"
 SIX = "the line has 6 fields where line 1 names 3"
 COMMAS_TWICE = "; numbers with decimal commas need another separator, such as the semicolon"
 COMMENT = "which is a comment; move comments above the names of the columns, or delete them"
@@ -96,6 +96,11 @@ REFUSED = {
     "date that does not exist": (f"t,u,y\n{DAY}8T12:00,1,2\n{DAY}9T12:00,1,2\n", f":3: {NO_DAY}"),
     "open quotation mark": ('t,u,y\n0,1,"2\n1,1,2\n', f":2: {QUOTE}"),
     "time missing": ("t,u,y\n0,1,2\n,1,2\n", f":3: time 't' is missing or not finite; {INSTANT} [s]"),
+    "time by position": (
+        "b,u,c\n2,1,0\n1,1,1\n",
+        ":3: time 'b' goes back to 1 s after 2 s on line 2; times must increase strictly. 'b' was taken as the time by "
+        "its position; if it is not, name the right one (option time, --time NAME)",
+    ),
     "time repeated": ("t [ms],u,y\n0,1,2\n5,1,2\n5,1,2\n", f":4: time 't [ms]' repeats 5 ms after 5 ms {STRICTLY}"),
     "time going back": ("t,u,y\n0,1,2\n1,1,2\n\n0.5,1,2\n", f":5: time 't' goes back to 0.5 s after 1 s {STRICTLY}"),
     "input missing": ("t,u,y\n0,1,2\n1,nan,2\n", f":3: input 'u' is missing or not finite{GAPS}"),
