@@ -2,14 +2,16 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.optimum.best_model import Begin, Optimum, best_near, best_of_orders
-from ctid_cli.estimation.optimum.box import box_of
+from ctid_cli.estimation.optimum.best_model import Optimum, best_near, best_of_orders
+from ctid_cli.estimation.optimum.box import Point, box_of, point_of
+from ctid_cli.estimation.optimum.search import Local
 from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
 from ctid_cli.estimators.additive_output_error import GROWN, AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
@@ -32,8 +34,14 @@ TRIED_AGAINST_NOISE = 6
 BEHIND = 30.0
 #: Poles (integrators included) and zeros of the structures with which settings of records are compared.
 SMALL = ((1, 0), (2, 1), (3, 2))
+#: A zero whose removal costs this many penalties of a parameter at the delays found is not tried at others.
+FAR_BEHIND = 10.0
 #: Fewest samples for each parameter of a structure.
 SAMPLES_PER_PARAMETER = 3
+
+
+#: Known model with numbers of integrators, poles and zeros; None if there is none.
+Known = Callable[[int, int, int], AnyModel | None]
 
 
 class Setting(NamedTuple):
@@ -162,36 +170,48 @@ class Structures:
 
     def _with_fewer_zeros(self, candidate: Candidate) -> Candidate:
         """Remove the zeros of each input that do not lower the criterion in white noise."""
-        names = self.measured.degrees.inputs
+        names, fit = self.measured.degrees.inputs, candidate.fit
         zeros = [candidate.options.zeros] * len(names)
-        if candidate.fit.poles_at_infinity or len(names) < 2:
+        if fit.poles_at_infinity or len(names) < 2:
             return candidate
-        worth = float(np.exp(PENALTY * np.log(candidate.fit.count) / candidate.fit.count))
+        point = self._point(fit.model)
+        error, penalty = fit.cost * fit.count, PENALTY * float(np.log(fit.count)) / fit.count
         for k in range(len(names)):
             while zeros[k] > 0:
                 fewer = [*zeros[:k], zeros[k] - 1, *zeros[k + 1 :]]
-                trial = self._near(candidate, fewer)
-                if trial.fit.cost > candidate.fit.cost * worth:
+                found = self._without_zero(fewer, point, error, penalty)
+                if np.log(found.squared_error / error) > penalty:
                     break
-                candidate, zeros = trial, fewer
-        return candidate
+                zeros, point, error = fewer, found.point, found.squared_error
+        return self._near(candidate, zeros, point) if min(zeros) < candidate.options.zeros else candidate
 
-    def _near(self, candidate: Candidate, zeros: Sequence[int]) -> Candidate:
-        """Fit numerators of other degrees, starting at a candidate."""
+    def _without_zero(self, zeros: Sequence[int], point: Point, error: float, penalty: float) -> Local:
+        """Return a minimum with numerators of other degrees, near one with this squared error."""
+        poles, most = point.poles.size, max(zeros)
+        problem = self.measured.with_degrees(poles + self.options.integrators, zeros).problem
+        search = StructureSearch(problem, self.search.box, effort=QUICK)
+        found = search.descent(most).descend(point)
+        if penalty < np.log(found.squared_error / error) < FAR_BEHIND * penalty:
+            # There may be a lower minimum at other delays.
+            search.refine(poles, most, [found.point])
+            return search.minima(poles, most)[0]
+        return found
+
+    def _near(self, candidate: Candidate, zeros: Sequence[int], point: Point) -> Candidate:
+        """Fit numerators of other degrees, starting at known poles and delays."""
         assert isinstance(candidate.options, DelayProfile)
         own = {one.name: one for one in candidate.options.inputs or ()}
         names = self.measured.degrees.inputs
         inputs = tuple(replace(own.get(name, InputModel(name)), zeros=m) for name, m in zip(names, zeros, strict=True))
         laid_out = self.measured.with_degrees(candidate.options.order, zeros)
         search = StructureSearch(laid_out.problem, self.search.box, effort=QUICK)
-        found = best_near(search, max(zeros), self._start(candidate.fit.model))
-        fit = fitted(laid_out, found, None, None)
+        fit = fitted(laid_out, best_near(search, max(zeros), point), None, None)
         size = laid_out.layout.size - candidate.options.integrators
         return replace(candidate, options=replace(candidate.options, inputs=inputs), fit=fit, size=size)
 
-    def _start(self, model: AnyModel) -> Begin:
-        """Return the denominator of a model, without integrators, and its delays."""
-        return np.atleast_1d(np.poly(self.measured.free_poles(model)).real), tuple(delays_of(model))
+    def _point(self, model: AnyModel) -> Point:
+        """Return the poles of a model, without integrators, and its delays."""
+        return point_of(self.measured.free_poles(model), delays_of(model), self.search.box)
 
     def model(self, poles: int, zeros: int) -> AnyModel | None:
         """Return a model that was fitted; None if there were too few samples."""
@@ -199,10 +219,10 @@ class Structures:
         return None if found is None else found.fit.model
 
     def _least(self, poles: int, zeros: int) -> Optimum:
-        start = None if self.near is None else self.near(poles, zeros)
-        if start is None:
+        near = None if self.near is None else self.near(poles, zeros)
+        if near is None:
             return best_of_orders(self.search, poles, zeros)
-        return best_near(self.search, zeros, self._start(start))
+        return best_near(self.search, zeros, self._point(near))
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +262,7 @@ def _modes(number: int, integrators: int) -> tuple[Term, ...]:
 
 
 class SmallModels:
-    """A few structures in several settings of the same records."""
+    """A few structures in several settings of the same records, found near known models if there are any."""
 
     def __init__(
         self,
@@ -250,7 +270,7 @@ class SmallModels:
         span: Span,
         delays: tuple[float, float],
         several: Several,
-        near: AnyModel | None = None,
+        near: Known | None = None,
         most: int = len(SMALL),
     ) -> None:
         self.records, self.span, self.delays, self.several = records, span, delays, several
@@ -278,10 +298,23 @@ class SmallModels:
         if key not in self._structures:
             pairs = ((one, number) for one, number in self._structures if one[1:3] == setting[1:3])
             alike = next((self._structures[pair] for pair in pairs if pair[1] == integrators), None)
-            model = self.near
-            near = (lambda *_: model) if model is not None else None if alike is None else alike.model
-            self._structures[key] = Structures.of(self.records, *key, self.delays, self.several, near)
+            near = None if alike is None else alike.model
+            near = near if self.near is None else partial(self.near, integrators)
+            self._structures[key] = Structures.of(self.records, *key, self.delays, self._begun(), near)
         return self._structures[key]
+
+    def _begun(self) -> Several:
+        """Return the options of several inputs, whose searches start at the delays found with fewer integrators."""
+        found = [each.fit for one in self._structures.values() for each in one.found.values()]
+        if self.several.first_delays is not None or not found or not self.records[0].several:
+            return self.several
+        best = min(found, key=lambda fit: fit.cost)
+        return self.several._replace(first_delays=tuple(delays_of(best.model)))
+
+    def model(self, integrators: int, poles: int, zeros: int) -> AnyModel | None:
+        """Return a model of a structure in the first setting with this number of integrators."""
+        each = (one for (_, number), one in self._structures.items() if number == integrators)
+        return next(each).model(poles, zeros)
 
 
 def grid(

@@ -16,7 +16,7 @@ from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import answer_of
 from ctid_cli.estimators.measured_fit import MultiInputFit
 from ctid_cli.identification import sentences
-from ctid_cli.identification.candidates import Setting, Several, SmallModels, Span, grid, with_hold
+from ctid_cli.identification.candidates import SMALL, Known, Setting, Several, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Ranking, Searched
 from ctid_cli.identification.held_back import without_overfitted
@@ -32,7 +32,7 @@ from ctid_cli.identification.initial_states import (
 from ctid_cli.identification.remedies import harmful_outliers, without_samples
 from ctid_cli.inference.input_response import analyse_response
 from ctid_cli.inference.signal_features import input_moves
-from ctid_cli.models.several_inputs import AnyModel, delays_of
+from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record, as_records
 from ctid_cli.signals.treatment import Holds
@@ -108,6 +108,8 @@ class _Choosing:
         self.several = Several(given.delays_of_inputs, not isinstance(given.zeros, int))
         self.first_hold: Holds = "zoh" if given.hold == "auto" else given.hold
         self.reasons: list[str] = []
+        #: Small models of several inputs, near which the settings are compared.
+        self.known: Known | None = None
 
     def choice(self) -> Choice:
         """Return the choice."""
@@ -119,7 +121,7 @@ class _Choosing:
         # A state, or a far too long delay, may make up for the dynamics that small models miss.
         span, narrower = Span.only(ranking.best.options), self._range_of(ranking, delays)
         narrower = narrower if narrower[1] < MUCH_NARROWER * delays[1] else delays
-        confirmed = self._setting(span, narrower, ranking.best.fit.model)
+        confirmed = self._setting(span, narrower, lambda *_: ranking.best.fit.model)
         if (narrower, confirmed) != (delays, setting):
             delays, setting = narrower, confirmed
             ranking = self._grid(setting, delays)
@@ -169,19 +171,26 @@ class _Choosing:
 
     def _delays(self) -> tuple[tuple[float, float], float]:
         """Return the range of the delay, and how far it may be extended [s]."""
-        given = self.given.delays_given
-        if given is not None:
-            return given, given[1]
+        given, several = self.given.delays_given, self.part[0].several
+        latest = self._latest() if given is None else given[1]
+        delays = given or (0.0, latest)
+        if given is not None and not several:
+            return delays, latest
+        # Assuming rest may bias the delay; an estimated state does not.
+        settings = self._settings(latest)[-1:]
+        most = len(SMALL) if several else 2
+        models = SmallModels(self._common(settings, latest), self.span, delays, self.several, most=most)
+        ranking = models.compared(settings)
+        self._note(ranking)
+        self.known = models.model if several else None
+        return self._range_of(ranking, delays), latest
+
+    def _latest(self) -> float:
+        """Return the greatest delay that is tried [s]."""
         length = min(record.duration for record in self.part)
         hints = [analyse_response(each).delay for record in self.part for each in record.each_input]
         later = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
-        latest = _rounded(min(max(LATEST * length, later), LATER * length))
-        # Assuming rest may bias the delay; an estimated state does not.
-        settings = self._settings(latest)[-1:]
-        models = SmallModels(self._common(settings, latest), self.span, (0.0, latest), self.several, most=2)
-        ranking = models.compared(settings)
-        self._note(ranking)
-        return self._range_of(ranking, (0.0, latest)), latest
+        return _rounded(min(max(LATEST * length, later), LATER * length))
 
     def _note(self, models: Ranking) -> None:
         """Keep the delays of the best small model, from which later searches of several inputs start."""
@@ -198,9 +207,9 @@ class _Choosing:
 
     # --- state, offset and hold ------------------------------------------------------------------------
 
-    def _setting(self, span: Span, delays: tuple[float, float], near: AnyModel | None = None) -> Setting:
-        """Return the best state, offset and hold with structures of a span; searches may start at a known model."""
-        self.reasons = []
+    def _setting(self, span: Span, delays: tuple[float, float], near: Known | None = None) -> Setting:
+        """Return the best state, offset and hold with structures of a span; searches start at known models."""
+        self.reasons, near = [], near or self.known
         settings = self._settings(delays[1])
         rests = [each for each in settings if each.initial_state == "rest"]
         if len(rests) > 1:

@@ -270,9 +270,8 @@ def best_sum(
     return _least(search, order, zeros, False)
 
 
-def best_near(search: StructureSearch, zeros: int, start: Begin) -> Optimum:
-    """Return the least squared error in the basin of given denominators, without integrators, and delays."""
-    point = _point(start, search.box)
+def best_near(search: StructureSearch, zeros: int, point: Point) -> Optimum:
+    """Return the least squared error in the basin of given poles, without integrators, and delays."""
     search.refine(point.poles.size, zeros, [point])
     return _least(search, point.poles.size, zeros, False)
 
