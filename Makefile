@@ -42,7 +42,7 @@ types: $(VENV)/.test-installed
 
 # One thread each: the threads of two workers wait for each other, and tests of frequencies took 3 to 5 times as long.
 pytest: $(VENV)/.test-installed
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --dist loadfile
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --dist loadfile --no-loadscope-reorder
 
 reproduce: $(VENV)/.installed
 	$(BIN)/ctid reproduce $(if $(RUNS),--runs $(RUNS)) --jobs $(JOBS) --out "$(OUT)"

@@ -17,7 +17,6 @@ from ctid_cli.estimation.sampled_problem import reflect_unstable
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.spectra import RecordSpectra, lowpass_weight, record_spectra
-from ctid_cli.filtering.spectral_kernels import least_cost, least_squares
 from ctid_cli.inference.fit import IterationRecord
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.signals.record import Record
@@ -62,6 +61,8 @@ class FilteredCost:
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
         """Return the least cost at a delay from given starts and with ``own`` from least squares."""
+        from ctid_cli.filtering.spectral_kernels import least_cost, least_squares  # numba is slow to import
+
         spectra, reach, steps = self.spectra, self.weights.size, self.steps
         data = spectra.frequencies[:reach], spectra.outputs[:reach], spectra.inputs(delay, reach), self.weights
         poles, order = self.structure.poles, self.structure.poles + self.integrators

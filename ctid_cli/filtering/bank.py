@@ -22,7 +22,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
-from ctid_cli.filtering import kernels
 from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
 from ctid_cli.filtering.realisation import chain, held_step, scaled_roots, transitions
 
@@ -95,6 +94,8 @@ class ModalForm(NamedTuple):
 
 def modal_form(a: Array, b: Array, integrators: int = 0) -> ModalForm:
     """Return the partial fractions of ``B/(p^l A)``; check their condition before use."""
+    from ctid_cli.filtering import kernels  # numba is slow to import
+
     w0, roots = scaled_roots(a)
     return ModalForm(*kernels.modal_form(a, b, integrators, roots * w0))
 
@@ -159,6 +160,8 @@ def _run(
     simulated: Array,
 ) -> None:
     """Run the compiled pass on the clock of a record."""
+    from ctid_cli.filtering import kernels  # numba is slow to import
+
     if states is None:
         states = np.zeros((modes.poles.size, 5), np.complex128)
     grid, clock = None, None
@@ -181,6 +184,8 @@ def chain_states(
     dynamics: Array, gain: Array, w0: float, data: FilterData, delay: Place, initial: Array | None = None
 ) -> Array:
     """Return ``[z, u]`` at all samples for the chain ``z' = w0 (F z + g u)``, shape (N, n + 1)."""
+    from ctid_cli.filtering import kernels  # numba is slow to import
+
     initial = np.zeros(gain.size) if initial is None else initial
     if data.interval == 0.0:
         longest = max(
@@ -234,6 +239,8 @@ class ChainForm(NamedTuple):
 
     def after_impulse(self, elapsed: Array) -> Array:
         """Return the states of both chains after an impulse of u [s]."""
+        from ctid_cli.filtering import kernels  # numba is slow to import
+
         dynamics, gain = self.double
         table = transitions(dynamics, gain, float(elapsed.max()) * self.w0)
         breaks = np.zeros(1), np.zeros(1), False

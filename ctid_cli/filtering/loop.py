@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.filtering import kernels
 from ctid_cli.filtering.filter_data import plain_array
 from ctid_cli.filtering.simulate import SampledModel, sampled_model, simulate
 from ctid_cli.models.additive import AdditiveModel
@@ -182,6 +181,8 @@ def loop_pass(
     relay: tuple[float, float, float] = NO_RELAY,
 ) -> tuple[Array, Array, Array]:
     """Return input, noise-free output and plant states of a sampled loop; arguments are those of the kernel."""
+    from ctid_cli.filtering import kernels  # numba is slow to import
+
     size = plant.from_input.size
     push = np.zeros((0, size)) if push is None else push
     start = (np.zeros(size), np.zeros(law[1].size), np.zeros(plant.shift)) if start is None else start

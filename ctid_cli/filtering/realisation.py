@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
-from ctid_cli.filtering import kernels
 
 #: A matrix is halved until its norm is below this, so that the remainder of its Taylor polynomial is below 1e-17.
 TAYLOR_NORM = 0.25
@@ -50,6 +49,8 @@ def polynomial_roots(coefficients: Array) -> ComplexArray:
         # The larger root has no cancellation, and the product of both is the last coefficient.
         large = half + copysign(sqrt(discriminant), half)
         return np.array([large, float(coefficients[2]) / large if large else 0.0], dtype=np.complex128)
+    from ctid_cli.filtering import kernels  # numba is slow to import
+
     companion = np.zeros((n, n))
     companion.flat[n :: n + 1] = 1.0
     companion[:1] = -coefficients[1:]
@@ -146,19 +147,21 @@ class Transitions(NamedTuple):
 
 def transitions(dynamics: Array, gain: Array, longest: float) -> Transitions:
     """Return the table for all steps up to the longest."""
+    from ctid_cli.filtering.kernels import BASE  # numba is slow to import
+
     n = gain.size
     # [z, v, v']' = M [z, v, v'] with v' constant over a step: no separate integrals of the input are needed.
     augmented = np.zeros((n + 2, n + 2))
     augmented[:n, :n], augmented[:n, n], augmented[n, n + 1] = dynamics, gain, 1.0
     quantum = QUANTUM_NORM / float(np.abs(augmented).sum(axis=1).max())
     levels = 1
-    while quantum * float(kernels.BASE) ** levels <= longest and levels < 40:
+    while quantum * float(BASE) ** levels <= longest and levels < 40:
         levels += 1
-    powers = np.zeros((levels, kernels.BASE, n + 2, n + 2))
+    powers = np.zeros((levels, BASE, n + 2, n + 2))
     for level in range(levels):
-        first = exponential_minus_identity(augmented * (quantum * float(kernels.BASE) ** level))
+        first = exponential_minus_identity(augmented * (quantum * float(BASE) ** level))
         power = np.zeros((n + 2, n + 2))
-        for digit in range(kernels.BASE):
+        for digit in range(BASE):
             powers[level, digit] = power + np.eye(n + 2)
             # (I + X)(I + Y) - I = X + Y + X Y, which keeps the accuracy of slow modes if there is a fast one.
             power = power + first + power @ first

@@ -19,7 +19,6 @@ from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.filter_data import plain_array
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.filtering.spectral_kernels import partial_sums, window_spectrum
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
@@ -142,6 +141,8 @@ class HeldSpectrum(NamedTuple):
 
         The gain multiplies the contribution of the breaks inside the window, not that of its ends.
         """
+        from ctid_cli.filtering.spectral_kernels import window_spectrum  # numba is slow to import
+
         return np.asarray(window_spectrum(*self, delay, gain))
 
 
@@ -149,6 +150,8 @@ def _held_spectrum(
     signal: HeldSignal, start: float, duration: float, greatest_delay: float, count: int
 ) -> HeldSpectrum:
     """Lay out a signal for ``count`` frequencies."""
+    from ctid_cli.filtering.spectral_kernels import partial_sums  # numba is slow to import
+
     signal = signal.lines
     times, values, foh = signal.t - start, plain_array(signal.values), signal.hold == "foh"
     steps = np.diff(times)

@@ -195,7 +195,12 @@ def decode(theta: Array, clock: Clock, roots: Array, omega: Array) -> int:
         return COMPLEX_ROOTS
     if not real_roots(theta, roots):
         flags = COMPLEX_ROOTS
-        roots[:] = np.roots(np.append(1.0, theta).astype(np.complex128)).real
+        companion = np.zeros((n, n), np.complex128)
+        for i in range(n):
+            companion[0, i] = -theta[i]
+            if i > 0:
+                companion[i, i - 1] = 1.0
+        roots[:] = np.linalg.eigvals(companion).real
     # The largest cosine belongs to the lowest frequency, and clipping preserves the order.
     if n > 2 or flags:
         roots[:] = np.sort(roots)[::-1]
@@ -467,7 +472,7 @@ def refresh(clock: Clock, whitener: Array, fit: Fit) -> None:
         theta[:] = -v[:n] / v[n:]
     # The lower limit prevents alarms by residuals of an exact fit, which are rounding.
     levels[ALARM] = (ALARM_RATIO * squared_residual(gram, theta) + ROUNDING_FLOOR * gram[n, n]) / weight
-    result, reliable = check_fit(gram, theta, fit.omega, clock, weight, counters[ROWS])
+    result, reliable = check_fit(gram, theta, fit.omega, clock, weight, float(counters[ROWS]))
     if not reliable:
         levels[ALARM] = np.inf
     inconsistent = flag_inconsistent(fit.moments[CHECK], fit.omega, clock.second_delay, NEGLIGIBLE)

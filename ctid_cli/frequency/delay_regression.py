@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import comb, gcd
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,8 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
 from ctid_cli.frequency.base import FrequencyEstimator, FrequencyTrack, series_of
-from ctid_cli.frequency.delay_kernels import Clock
 from ctid_cli.signals.checks import Checked, require_not_negative, require_positive
+
+if TYPE_CHECKING:
+    from ctid_cli.frequency.delay_kernels import Clock
 
 #: Longest delay in sampling intervals: the samples of 2 n delays are stored.
 LONGEST_DELAY = 10_000_000
@@ -113,6 +115,8 @@ class DelayRegression(Checked, FrequencyEstimator):
 
     def clock(self, interval: float) -> Clock:
         """Return the regression at a sampling interval [s]."""
+        from ctid_cli.frequency.delay_kernels import Clock  # numba is slow to import
+
         lag = whole_delay("h", self.h, interval)
         second, every = second_lag(lag), max(1, min(lag // CHECKS_PER_DELAY, MOST_BETWEEN))
         return Clock(float(interval), lag, lag * interval, second, second * interval, every)

@@ -12,11 +12,9 @@ from itertools import combinations
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from ctid_cli.arrays import Array, IntArray
-from ctid_cli.frequency.delay_kernels import CHECKED_SPANS, Checks, check_estimates
+from ctid_cli.arrays import Array
 from ctid_cli.frequency.delay_regression import DelayRegression, Online, Tail, theta_of, whole_delay
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.checks import require_integer, require_positive
@@ -194,6 +192,8 @@ class OnlineMixing(Online):
     scale = 1.0
 
     def __init__(self, options: MixingOptions, interval: float, window: int, past: float = np.nan) -> None:
+        from ctid_cli.frequency.delay_kernels import Checks  # numba is slow to import
+
         super().__init__(options, interval, past=past)
         n, filled = options.tones, 2 * options.tones * self.clock.lag
         self._ages = (options.first_row + np.arange(n)) * whole_delay("d", options.d, interval)
@@ -213,6 +213,9 @@ class OnlineMixing(Online):
 
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
         """Process samples, and write the frequencies and the flags at their instants."""
+        from ctid_cli.frequency.delay_kernels import check_estimates  # numba is slow to import
+        from ctid_cli.frequency.drem_kernels import slide
+
         rows, n = self.rows(samples), omega.shape[1]
         history, count = self._mixed_rows.extended(rows[0]), samples.size
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
@@ -234,7 +237,8 @@ class OnlineMixing(Online):
         flags[~found & (used > 0)] |= int(Flag.GAP)
         flags[~excited & (used > 0)] |= int(Flag.UNDETERMINED)
         counts = np.column_stack((excited * sums[:, n + 2], self._reach + support, self._reach + used))
-        grams = sums[:, n + 3 :].reshape(count, 2, -1)
+        # A block of one sample needs no kernel of its own.
+        grams = np.ascontiguousarray(sums[:, n + 3 :]).reshape(count, 2, -1)
         check_estimates(theta, rows[0], grams, counts, self.clock, self._checks, omega, flags)
 
 
@@ -242,6 +246,8 @@ class OnlineGradient(OnlineMixing):
     """Online gradient or finite-time estimation."""
 
     def __init__(self, options: DremGradient, interval: float) -> None:
+        from ctid_cli.frequency.delay_kernels import CHECKED_SPANS  # numba is slow to import
+
         n, lag = options.tones, whole_delay("h", options.h, interval)
         super().__init__(options, interval, CHECKED_SPANS * n * lag, np.nan if options.gated else 0.0)
         self.scale = float(options.epsilon) ** (n if options.power == "literal" else int(options.power))
@@ -252,54 +258,11 @@ class OnlineGradient(OnlineMixing):
 
     def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
         """Return theta by gradient steps, and the mixed rows so far."""
+        from ctid_cli.frequency.drem_kernels import gradient_steps  # numba is slow to import
+
         theta = np.empty((len(mixed), self.options.tones))
         gradient_steps(mixed, *self._descent, theta)
         return theta, used
-
-
-@njit(cache=True, nogil=True)
-def gradient_steps(mixed: Array, gains: Array, initial: Array, finite_time: bool, steps: Array, theta: Array) -> None:
-    """Solve ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)`` exactly over intervals with constant Delta and Psi.
-
-    ``theta = z + (1 - q) theta(0)``, with z and q in ``steps``; the finite-time estimate is ``z/q``. Rows with NaN are
-    ignored.
-    """
-    z, q = steps
-    for k in range(len(mixed)):
-        delta = mixed[k, -1]
-        for i in range(gains.size):
-            if np.isfinite(delta):
-                # m = 1 - exp(-x), the share of the new row; gain = gamma m/x without 0/0 for zero Delta.
-                x = gains[i] * delta * delta
-                m = -np.expm1(-x)
-                gain = gains[i] * (m / x if x > 1e-8 else 1.0 - 0.5 * x)
-                z[i] += gain * delta * mixed[k, i] - m * z[i]
-                q[i] += m * (1.0 - q[i])
-            theta[k, i] = z[i] / q[i] if finite_time and q[i] > 0.0 else z[i] + (1.0 - q[i]) * initial[i]
-
-
-@njit(cache=True, nogil=True)
-def slide(entries: Array, window: Array, newer: Array, place: IntArray, sums: Array) -> None:
-    """Sum entries over a sliding window.
-
-    A block of old entries is summed backwards once, and the newer ones forwards, without subtractions, so that rounding
-    errors do not outlast the entries. ``window`` contains single entries before ``place`` and, from there on, sums of
-    each entry with all following ones.
-    """
-    last = len(window) - 1
-    for k in range(len(entries)):
-        window[place[0]] = entries[k]
-        newer += entries[k]
-        sums[k] = newer
-        if place[0] < last:
-            # The next place contains the sum of all older entries in the window.
-            sums[k] += window[place[0] + 1]
-            place[0] += 1
-            continue
-        for j in range(last - 1, -1, -1):
-            window[j] += window[j + 1]
-        newer[:] = 0.0
-        place[0] = 0
 
 
 def mix(rows: Sequence[Array]) -> Array:

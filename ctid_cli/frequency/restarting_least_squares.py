@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array
-from ctid_cli.frequency.delay_kernels import Fit, Restarting, restarting_fits
 from ctid_cli.frequency.delay_regression import ROWS_PER_TONE, DelayRegression, Online
 from ctid_cli.signals.checks import require_positive
 
@@ -84,6 +83,8 @@ class OnlineRestarting(Online):
     """Online estimation with restarts."""
 
     def __init__(self, options: RestartingLeastSquares, interval: float) -> None:
+        from ctid_cli.frequency.delay_kernels import Fit, Restarting  # numba is slow to import
+
         super().__init__(options, interval)
         n, lag, length = options.tones, self.clock.lag, self.weights.size - 1
         memory = DEFAULT_MEMORY * self.clock.delay if options.memory is None else options.memory
@@ -107,6 +108,8 @@ class OnlineRestarting(Online):
 
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
         """Process samples, and write the frequencies and the flags at their instants."""
+        from ctid_cli.frequency.delay_kernels import restarting_fits  # numba is slow to import
+
         restarting_fits(self.rows(samples), self.clock, self._settings, self._fit, omega, flags)
 
 

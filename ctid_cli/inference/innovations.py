@@ -20,7 +20,6 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray, IntArray
 from ctid_cli.inference.noise_model import levinson
@@ -40,58 +39,6 @@ EXACT, ROUGH, EVALUATIONS = 1e-12, 1e-6, 40
 DIFFERENCE = 1e-5
 
 
-@njit(cache=True, nogil=True)
-def filter_innovations(
-    rows: Array, steps: IntArray, denominator: Array, gain: Array, states: Array, covariance: Array, after: Array
-) -> float:
-    """Replace rows by their innovations over standard deviations, and update states and covariance, in place.
-
-    ``steps`` are the intervals of the clock from the previous sample to each sample, 0 or 1 at the first one. F is a
-    shift matrix with the negative denominator ``d_1 ... d_r`` in its first column. Returns the sum of the logarithms of
-    the variances; ``after``, unless empty, gets the predicted states of the first row.
-    """
-    r, logarithms, known = gain.size, 0.0, False
-    # A column and a row of zeros avoid branches at the ends.
-    moved, feedback, old = np.zeros((r + 1, r + 1)), gain.copy(), np.zeros(r + 1)
-    for t in range(steps.size):
-        # Intervals without a sample, then one with it, which ends with the prediction of the next.
-        for left in range(max(steps[t], 1) - 1, -1, -1):
-            variance = 1.0
-            if not known or left:
-                if r:
-                    variance += covariance[0, 0]
-                for i in range(r):
-                    for j in range(r):
-                        moved[i, j] = covariance[i, j]
-                for i in range(r):
-                    feedback[i] = (moved[i + 1, 0] - denominator[i] * moved[0, 0] + gain[i]) / variance
-                largest = 0.0
-                for i in range(r):
-                    for j in range(r):
-                        value = (
-                            moved[i + 1, j + 1] - denominator[j] * moved[i + 1, 0] - denominator[i] * moved[0, j + 1]
-                        )
-                        value += denominator[i] * denominator[j] * moved[0, 0] + gain[i] * gain[j]
-                        if not left:
-                            value -= variance * feedback[i] * feedback[j]
-                        covariance[i, j] = value
-                        largest = max(largest, abs(value))
-                # A known state stays known until a sample is missing.
-                known = not left and largest < 1e-14
-            for k in range(rows.shape[0]):
-                for i in range(r):
-                    old[i] = states[i, k]
-                innovation = 0.0 if left else rows[k, t] - old[0]
-                for i in range(r):
-                    states[i, k] = old[i + 1] - denominator[i] * old[0] + feedback[i] * innovation
-                if not left:
-                    rows[k, t] = innovation / variance**0.5
-        logarithms += np.log(variance)
-        for i in range(after.shape[1] if after.size else 0):
-            after[t, i] = states[i, 0]
-    return logarithms
-
-
 class Whitener:
     """State of the innovations filter of one record, for any number of rows."""
 
@@ -103,6 +50,8 @@ class Whitener:
 
     def __call__(self, rows: Array, steps: IntArray, after: Array | None = None) -> Array:
         """Whiten further samples of all rows in place, shape (rows, count)."""
+        from ctid_cli.inference.noise_kernels import filter_innovations  # numba is slow to import
+
         after = np.zeros((0, self.gain.size)) if after is None else after
         own = -self.transition[:, 0] if self.gain.size else self.gain, self.gain, self.states, self.covariance
         self.logarithm += filter_innovations(rows, steps, *own, after)

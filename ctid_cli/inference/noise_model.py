@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 
 from ctid_cli.arrays import Array
 
@@ -92,6 +91,8 @@ class NoiseModel:
         R is symmetric in time, so ``columns' R columns = s^2 sum g g'`` with ``g = c(q)^{-1} columns``, over all times,
         including the free response of the recursion after the last row.
         """
+        from ctid_cli.inference.noise_kernels import autoregress  # numba is slow to import
+
         r = self.order
         if not len(columns):
             return np.zeros((0, 0))
@@ -113,17 +114,6 @@ class NoiseModel:
                     energy, step = energy + more, step @ step
                 total += before.T @ energy @ before
         return np.asarray(self.innovation_variance * total)
-
-
-@njit(cache=True, nogil=True)
-def autoregress(columns: Array, coefficients: Array) -> None:
-    """Filter columns by ``1/c(q)`` in place; the first r rows are outputs already."""
-    r = coefficients.size - 1
-    for t in range(r, columns.shape[0]):
-        # Row by row, for contiguous memory access.
-        for i in range(1, r + 1):
-            for j in range(columns.shape[1]):
-                columns[t, j] -= coefficients[i] * columns[t - i, j]
 
 
 def fit_noise_model(blocks: Sequence[Array], max_order: int | None = None, penalty: float = 2.0) -> NoiseModel:

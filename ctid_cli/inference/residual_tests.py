@@ -9,7 +9,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.intervals import normal_quantile, robust_deviation
-from ctid_cli.inference.noise_model import NoiseModel, Rows, autoregress, fit_noise_model, row_blocks
+from ctid_cli.inference.noise_model import NoiseModel, Rows, fit_noise_model, row_blocks
 from ctid_cli.signals.record import Record
 from ctid_cli.text import probability
 
@@ -373,6 +373,8 @@ def feedback_p_value(score: float) -> float:
 
 def _behind_a_pole(x: Array, time_constants: Array) -> Array:
     """Return samples filtered by first-order low-pass filters with time constants in samples."""
+    from ctid_cli.inference.noise_kernels import autoregress  # numba is slow to import
+
     columns = np.empty((x.size, time_constants.size))
     for column, p in zip(columns.T, np.exp(-1.0 / time_constants), strict=True):
         behind = (1.0 - p) * x[:, None]

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from ctid_cli.frequency.delay_regression import theta_of
-from ctid_cli.frequency.drem import DremFiniteTime, DremGradient, DremWindow, slide
+from ctid_cli.frequency.drem import DremFiniteTime, DremGradient, DremWindow
+from ctid_cli.frequency.drem_kernels import slide
 from ctid_cli.frequency.flags import Flag
 from tests.frequency.signals import INTERVAL, OMEGA, frequencies_of, regression_rows, tones
 

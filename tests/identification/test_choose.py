@@ -34,9 +34,9 @@ def record_of(model, *, seed=0, u=None, past=0, offset=0.0, colour=0.0, deviatio
 
 
 @cache
-def choice_of_second():
-    """Return the choice for the record that most tests use."""
-    return choose(record_of(SECOND))
+def choice_of(model, **made):
+    """Return the choice for a record that several tests use."""
+    return choose(record_of(model, **made))
 
 
 def step(lead, count=600):
@@ -44,12 +44,12 @@ def step(lead, count=600):
 
 
 @pytest.mark.parametrize(
-    ("model", "colour", "expected"),
-    [(SECOND, 0.0, (2, 0, 0)), (SECOND, 0.9, (2, 0, 0)), (DRIVE, 0.0, (1, 0, 1))],
+    ("model", "made", "expected"),
+    [(SECOND, {}, (2, 0, 0)), (SECOND, {"colour": 0.9, "deviation": 0.03}, (2, 0, 0)), (DRIVE, {}, (1, 0, 1))],
     ids=["white", "coloured", "integrating"],
 )
-def test_the_structure_that_made_a_record_is_found(model, colour, expected):
-    choice = choose(record_of(model, colour=colour, deviation=0.03))
+def test_the_structure_that_made_a_record_is_found(model, made, expected):
+    choice = choice_of(model, **made)
     options = choice.options
     assert (options.poles, options.zeros, options.integrators) == expected
     assert options.delay_bounds[0] <= model.delay <= options.delay_bounds[1] < 6.0
@@ -62,16 +62,16 @@ def test_the_structure_that_made_a_record_is_found(model, colour, expected):
     [({"past": 37}, "estimate", "none"), ({"offset": 3.0}, "rest", "estimate")],
 )
 def test_state_and_offset_are_those_that_were_made(made, state, offset):
-    assert (choice_of_second().options.initial_state, choice_of_second().options.offset) == ("rest", "none")
-    options = choose(record_of(SECOND, **made)).options
+    assert (choice_of(SECOND).options.initial_state, choice_of(SECOND).options.offset) == ("rest", "none")
+    options = choice_of(SECOND, **made).options
     assert (options.initial_state, options.offset) == (state, offset)
 
 
 def test_outliers_are_left_out_of_the_choice_and_given_another_loss():
-    record, clean = record_of(SECOND), choice_of_second()
-    y = record.y.copy()
+    record, given = record_of(SECOND), Given(poles=(1, 3), zeros=0)
+    y, clean = record.y.copy(), choose(record, given)
     y[[30, 90, 400]] += (30.0, -40.0, 25.0)
-    choice = choose(replace(record, y=y))
+    choice = choose(replace(record, y=y), given)
     assert " ".join(choice.words()) == " ".join(clean.words()).replace(" --hold", " --loss tukey --hold")
     assert choice.options == replace(clean.options, loss="tukey")
     assert choice.sentences[0].startswith("Loss: tukey (--loss), as 3 output samples are outliers")
@@ -110,7 +110,7 @@ def test_a_step_at_the_beginning_does_not_tell_an_integrator_from_a_drift():
 
 @pytest.mark.parametrize("why", ["undetermined", "undamped"])
 def test_what_is_no_candidate_comes_last_and_tells_nothing_of_the_noise(why):
-    best, other, *_ = choice_of_second().ranking.candidates
+    best, other, *_ = choice_of(SECOND).ranking.candidates
     if why == "undetermined":
         fit = replace(best.fit, condition_number=1e15)
     else:
@@ -121,7 +121,7 @@ def test_what_is_no_candidate_comes_last_and_tells_nothing_of_the_noise(why):
 
 
 def test_the_grid_goes_on_while_more_poles_pay_against_white_noise():
-    ranking = choice_of_second().ranking
+    ranking = choice_of(SECOND).ranking
     assert max(each.options.order for each in ranking.candidates) == 4
     assert not still_pays(ranking, 4)
     best = ranking.best
@@ -133,7 +133,7 @@ def test_the_grid_goes_on_while_more_poles_pay_against_white_noise():
 def test_a_structure_that_predicts_far_worse_than_a_smaller_one_is_no_candidate(monkeypatch, ratio, chosen):
     # Blocks are predicted with this ratio of their squared error to that of the fit.
     record = record_of(SECOND)
-    best = choice_of_second().ranking.best
+    best = choice_of(SECOND).ranking.best
     sizes = {4: ratio, 3: 1.2, 2: 1.0}
     grid = [
         replace(best, options=replace(best.options, poles=poles), criterion=best.criterion + 10.0 * (k - 1))
@@ -153,7 +153,7 @@ def test_a_structure_that_predicts_far_worse_than_a_smaller_one_is_no_candidate(
 
 def test_the_hold_is_compared_where_the_input_moves_continuously():
     u = np.sin(np.outer(0.1 * np.arange(600), [0.7, 1.9, 3.1, 5.3, 8.0]) + np.arange(5)).sum(axis=1)
-    made = choose(record_of(SECOND, u=u, hold="foh", deviation=0.003))
+    made = choose(record_of(SECOND, u=u, hold="foh", deviation=0.003), Given(poles=2, zeros=0))
     assert made.records[0].input.hold != "zoh"
     assert any(sentence.startswith("Hold: ") for sentence in made.sentences)
 
@@ -175,8 +175,7 @@ def test_what_is_given_is_kept():
 
 
 def test_the_choice_typed_out_is_the_same_model():
-    record = record_of(SECOND, offset=2.0)
-    choice = choose(record)
+    choice = choice_of(SECOND, offset=3.0)
     words = dict(zip(choice.words()[::2], choice.words()[1::2], strict=True))
     low, high = map(float, words["--delay"].split(":"))
     typed = Given(
@@ -189,22 +188,26 @@ def test_the_choice_typed_out_is_the_same_model():
         None if words["--input-before"] == "first" else float(words["--input-before"]),
         words["--hold"],
     )
-    again = identify(record, typed)
+    again = identify(record_of(SECOND, offset=3.0), typed)
     np.testing.assert_allclose(again.fit.theta, choice.ranking.best.fit.theta, rtol=1e-9)
 
 
 def test_a_validation_record_has_a_state_and_an_offset_of_its_own():
     other = record_of(SECOND, seed=1, past=37, offset=-4.0)
-    found = identify([record_of(SECOND), record_of(SECOND, seed=2)], validation=other)
+    found = identify([record_of(SECOND), record_of(SECOND, seed=2)], Given(poles=2, zeros=0), validation=other)
     assert found.options.initial_state == "rest"
     assert found.validation.options.initial_state == "estimate"
     assert found.validation.fit_percent > 85
 
 
-def test_a_validation_record_does_not_change_the_model():
+def test_a_validation_record_does_not_change_the_model(monkeypatch):
+    record, asked = record_of(SECOND), []
+    monkeypatch.setattr("ctid_cli.identification.identify.choose", lambda *of: asked.append(of) or choice_of(SECOND))
     other = record_of(TransferFunction([-2.0], [1.0, 1.2, 4.0], 0.23), seed=1)
-    alone, validated = (identify(record_of(SECOND), validation=each) for each in (None, other))
-    assert alone.choices == choice_of_second().sentences
+    alone, validated = (identify(record, validation=each) for each in (None, other))
+    # The choice gets nothing of the other record.
+    assert asked == [([record], Given(), "s")] * 2
+    assert alone.choices == choice_of(SECOND).sentences
     first, *others = validated.warnings
     assert "does not generalise" in first
     assert (validated.choices, validated.options, others) == (alone.choices, alone.options, list(alone.warnings))
@@ -215,7 +218,7 @@ def test_no_response_is_no_model():
     noise = record_of(SECOND)
     noise = Record(noise.t, np.random.default_rng(5).standard_normal(600), noise.input)
     with pytest.raises(DataError, match="No model"):
-        identify(noise)
+        identify(noise, Given(zeros=0))
 
 
 def test_a_part_of_a_long_record_is_looked_at():

@@ -10,7 +10,8 @@ from pathlib import Path
 from ctid_cli.errors import CtidError
 from ctid_cli.running.engine import Progress, run_experiment
 from ctid_cli.running.plan import Plan
-from tests.running.fakes import Toy, toy_plan
+from tests.running.fakes import toy_plan
+from tests.running.toys import Toy
 
 
 def plan(seconds: float = 0.02, runs: int = 20) -> Plan:

@@ -17,7 +17,8 @@ from ctid_cli.running.plan import Plan
 from ctid_cli.running.workers import packed, unpacked
 from ctid_cli.signals.files import COPIES
 from ctid_cli.simulation.dataset import require_content
-from tests.running.fakes import Toy, exported, run, toy_plan
+from tests.running.fakes import exported, run, toy_plan
+from tests.running.toys import Toy
 
 # As errors, warnings would end the dask threads in which they occur.
 pytestmark = pytest.mark.filterwarnings("default")

@@ -29,7 +29,8 @@ from ctid_cli.storage.journal import read_journal
 from ctid_cli.storage.manifest import slots
 from ctid_cli.storage.status import experiment_status
 from tests.running import run_toys
-from tests.running.fakes import Toy, exported, run, toy_plan
+from tests.running.fakes import exported, run, toy_plan
+from tests.running.toys import Toy
 
 Start = Callable[..., subprocess.Popen[str]]
 ROOT = Path(__file__).resolve().parents[2]
@@ -166,7 +167,7 @@ def test_an_estimator_that_raises_is_recorded_with_the_place(tmp_path: Path) -> 
     assert summary.failed == 6
     message = failed["message"].iloc[0]
     assert message.startswith("ZeroDivisionError: <object object at 0x…> is no good\n")
-    assert "fakes.py:" in message
+    assert "toys.py:" in message
     assert str(ROOT) not in message
     assert failed["delay"].isna().all()
     assert not failed["converged"].any()

@@ -14,7 +14,8 @@ from ctid_cli.running.job import DataCell, EstimatorCell, Job, Short, run_job
 from ctid_cli.simulation.dataset import DataSet
 from ctid_cli.storage.columns import no_result
 from ctid_cli.storage.manifest import Key
-from tests.running.fakes import STARTS, FakeFit, FakeRecord, Prepared, Toy, ToySource, outcomes_of
+from tests.running.fakes import STARTS, outcomes_of
+from tests.running.toys import FakeFit, FakeRecord, Prepared, Toy, ToySource
 
 
 @dataclass(frozen=True)

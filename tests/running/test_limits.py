@@ -14,7 +14,8 @@ from ctid_cli.running import limits, workers
 from ctid_cli.running.engine import Progress, preview
 from ctid_cli.running.limits import StopRequest
 from ctid_cli.storage.estimates import read_estimates
-from tests.running.fakes import Toy, exported, run, toy_plan
+from tests.running.fakes import exported, run, toy_plan
+from tests.running.toys import Toy
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
-from ctid_cli.filtering import kernels
 from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, Modes, Place, chain_states, modal_pass, to_steady_state
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.frequency_lines import FrequencyLines
@@ -390,6 +389,8 @@ class Chain:
 
     def free(self, elapsed: Array, second: bool) -> Array:
         """Return rows ``[z, w]`` after an impulse, transposed."""
+        from ctid_cli.filtering import kernels  # numba is slow to import
+
         table = transitions(self.free_dynamics, 0.0 * self.free_gain, float(elapsed[-1]))
         breaks = np.zeros(1), np.zeros(1), False
         return np.asarray(kernels.irregular_states(*table, *breaks, elapsed, 0.0, self.free_gain)[:, :-2].T)
