@@ -20,6 +20,8 @@ LEVELS: tuple[Level, ...] = ("ok", "note", "warning", "problem")
 JITTER = 0.05
 #: Below this order of excitation a model with a delay cannot be distinguished from one without.
 ENOUGH_ORDER = 4
+#: How a loop is declared.
+LOOP = "if a controller sets the input, fit with --loop FILE, which describes it, or with --loop unknown"
 
 
 class Finding(NamedTuple):
@@ -205,7 +207,8 @@ class _Sentences:
                 missed.append(f"{topic} {size}")
         p = probability(parts.feedback_p_value)
         if parts.feedback_p_value <= LEVEL:
-            yield Finding("warning", "feedback", f"The input follows the noise of the output, as in a loop ({p}).")
+            text = f"The input follows the noise of the output, as in a loop ({p})"
+            yield Finding("warning", "feedback", f"{text}; {LOOP}.")
         else:
             missed.append(f"feedback ({p})")
         missed += ["outliers"] * (not parts.outliers) + ["saturation"] * (not self.facts.saturated)

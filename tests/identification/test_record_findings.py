@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.identification.record_findings import findings
 from ctid_cli.inference.record_facts import record_facts
+from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
@@ -43,3 +45,11 @@ def test_an_output_that_diverges_is_a_problem():
 @pytest.mark.parametrize(("n", "words"), [(1, "Only 1 output sample:"), (7, "Only 7 output samples:")])
 def test_few_samples_are_counted(n, words):
     assert sentences_of(y=Y[:n])["samples"].sentence.startswith(words)
+
+
+def test_of_a_loop_the_options_that_declare_it_are_named():
+    v = 0.3 * np.random.default_rng(2).normal(size=400)
+    loop = simulate_loop(TransferFunction([1.0], [1.0, 1.0], 0.1), DiscreteController([1.5], [1.0]), U, v, 0.1)
+    found = sentences_of(loop.u, loop.x + v)["feedback"]
+    assert found.level == "warning"
+    assert "--loop unknown" in found.sentence
