@@ -182,9 +182,14 @@ def _delays(fit: FittedModel) -> list[float]:
     return [fit._estimated().parametric.model.delay]
 
 
+def _of_loop(fit: FittedModel) -> bool:
+    """Return whether a model was estimated in a loop."""
+    return isinstance(fit, Identification) and isinstance(fit.options, LoopOutputError)
+
+
 def _needs_loop(fit: FittedModel, record: Record) -> bool:
     """Return whether a model is compared in a loop; without one a stable plant follows the measured input."""
-    if not (isinstance(fit, Identification) and isinstance(fit.options, LoopOutputError)):
+    if not _of_loop(fit):
         return False
     return record.loop is not None or bool(np.any(fit._estimated().parametric.model.poles.real > 0))
 
@@ -193,10 +198,9 @@ def _treated(
     fit: FittedModel, parametric: Parametric | None, record: Record, state: InitialState, shift: Offset
 ) -> AppliedModel:
     """Return the model with its best initial state and offset, by its estimator or as one fraction."""
-    looped = isinstance(fit, Identification) and isinstance(fit.options, LoopOutputError)
-    if isinstance(fit, Identification) and (not looped or _needs_loop(fit, record)):
+    if isinstance(fit, Identification) and (not _of_loop(fit) or _needs_loop(fit, record)):
         treated: dict[str, Any] = {"initial_state": state, "offset": shift}
-        if looped and record.loop is None:
+        if _of_loop(fit) and record.loop is None:
             treated["delay_bounds"] = tuple(2 * _delays(fit))
         try:
             options = replace(fit.options, **treated)

@@ -188,8 +188,7 @@ class Structures:
     def _without_zero(self, zeros: Sequence[int], point: Point, error: float, penalty: float) -> Local:
         """Return a minimum with numerators of other degrees, near one with this squared error."""
         poles, most = point.poles.size, max(zeros)
-        problem = self.measured.with_degrees(poles + self.options.integrators, zeros).problem
-        search = StructureSearch(problem, self.search.box, effort=QUICK)
+        _, search = self._quick(zeros, point)
         found = search.descent(most).descend(point)
         if penalty < np.log(found.squared_error / error) < FAR_BEHIND * penalty:
             # There may be a lower minimum at other delays.
@@ -203,11 +202,15 @@ class Structures:
         own = {one.name: one for one in candidate.options.inputs or ()}
         names = self.measured.degrees.inputs
         inputs = tuple(replace(own.get(name, InputModel(name)), zeros=m) for name, m in zip(names, zeros, strict=True))
-        laid_out = self.measured.with_degrees(candidate.options.order, zeros)
-        search = StructureSearch(laid_out.problem, self.search.box, effort=QUICK)
+        laid_out, search = self._quick(zeros, point)
         fit = fitted(laid_out, best_near(search, max(zeros), point), None, None)
         size = laid_out.layout.size - candidate.options.integrators
         return replace(candidate, options=replace(candidate.options, inputs=inputs), fit=fit, size=size)
+
+    def _quick(self, zeros: Sequence[int], point: Point) -> tuple[MeasuredRecords, StructureSearch]:
+        """Prepare numerators of other degrees, with the number of poles of a point, and their search."""
+        laid_out = self.measured.with_degrees(point.poles.size + self.options.integrators, zeros)
+        return laid_out, StructureSearch(laid_out.problem, self.search.box, effort=QUICK)
 
     def _point(self, model: AnyModel) -> Point:
         """Return the poles of a model, without integrators, and its delays."""

@@ -143,6 +143,7 @@ def record_facts(record: Record) -> RecordFacts:
     """
     moves = input_moves(record)
     response = analyse_response(record, moves)
+    spacing, sampled = sampled_input(record)
     t, present = record.t, record.y[record.valid]
     steps = np.diff(t) if t.size > 1 else np.array([math.nan])
     interval = float(np.median(steps))
@@ -164,8 +165,8 @@ def record_facts(record: Record) -> RecordFacts:
         input_levels=moves.levels,
         input_changes=int(moves.changes.size),
         shortest_hold=moves.shortest_hold,
-        input_period=_input_period(record),
-        excitation_order=excitation_order(record, moves, response),
+        input_period=spacing * (find_period(sampled) or math.nan),
+        excitation_order=excitation_order(spacing, sampled, moves, response),
         input_band=response.input_band,
         output_quantum=quantum(present),
         saturated=saturated(present),
@@ -247,21 +248,14 @@ def _gross(y: Array) -> IntArray:
     return far
 
 
-def _sampled_input(record: Record) -> tuple[float, Array]:
+def sampled_input(record: Record) -> tuple[float, Array]:
     """Return the interval of a regular grid, and the input on it."""
     grid = regular_grid(record)
     return grid.interval, record.input.at(record.t[0] + grid.interval * (np.arange(grid.u.size) + 1e-6))
 
 
-def _input_period(record: Record) -> float:
-    """Return the period of the input; NaN if it does not repeat itself."""
-    interval, u = _sampled_input(record)
-    return interval * (find_period(u) or math.nan)
-
-
-def excitation_order(record: Record, moves: InputMoves, response: InputResponse) -> int:
+def excitation_order(interval: float, u: Array, moves: InputMoves, response: InputResponse) -> int:
     """Return the order of persistent excitation, at most 50: the rank of the autocovariance of the input to -40 dB."""
-    interval, u = _sampled_input(record)
     highest = response.input_band[1]
     if moves.kind == "continuous" and highest > 0:
         # Neighbouring samples of a slow input are nearly equal: subsample it according to its bandwidth.

@@ -137,6 +137,8 @@ def delay(model: ResponseModel, slow: Sequence[int], steps: Array) -> Estimate:
         likelihood = np.exp(-0.5 * WEIGHT * (values - values.min())).sum(axis=1)
         below, ends = np.cumsum(likelihood) / likelihood.sum(), np.append(tried[1:], last)
         least, most = int(np.argmax(below > TAILS[0])), int(np.argmax(below >= TAILS[1]))
+        if tried.size == last - first:  # every one
+            break
         first, last = int(tried[max(least - 1, 0)]), int(ends[min(most + 1, tried.size - 1)])
     # A response in the last part of an interval cannot be distinguished from one that begins with the next.
     low = edges[tried[least]] - 0.5 * (edges[tried[least]] - edges[tried[least - 1]] if least else 0.0)

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from ctid_cli import HeldSignal, Record, TransferFunction, simulate
 from ctid_cli.inference.input_response import analyse_response, regular_grid
-from ctid_cli.inference.record_facts import excitation_order, record_facts
+from ctid_cli.inference.record_facts import excitation_order, record_facts, sampled_input
 from ctid_cli.inference.record_tests import LEVEL
 from ctid_cli.inference.signal_features import input_moves
 
@@ -121,7 +121,7 @@ def test_excitation_counts_two_for_every_tone(tones):
     u = sum(np.sin(w * t + w) for w in (0.5, 1.3, 2.9, 4.7)[:tones])
     record = Record.from_arrays(t, u, simulate(FIRST_ORDER, HeldSignal(t, u, "foh"), t))
     moves = input_moves(record)
-    assert excitation_order(record, moves, analyse_response(record, moves)) == 2 * tones
+    assert excitation_order(*sampled_input(record), moves, analyse_response(record, moves)) == 2 * tones
 
 
 def test_gaps_and_periods():
