@@ -22,6 +22,7 @@ from ctid_cli.inference.noise_estimate import orders_of
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty, estimate_uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.processors import one_thread
 from ctid_cli.signals.checks import (
     require_choice,
     require_finite,
@@ -156,6 +157,7 @@ class Estimator(Generic[LaidOut, AnyFit]):
         Most estimators choose their starts and accept any.
         """
 
+    @one_thread
     def prepare(self, record: Any) -> Prepared[LaidOut, AnyFit]:
         """Check a record, or several if allowed, and prepare it once for any number of starts.
 
@@ -184,6 +186,7 @@ class Prepared(Generic[LaidOut, AnyFit]):
     #: Whether the record is from a feedback loop that the estimator ignores.
     in_ignored_loop: bool = False
 
+    @one_thread
     def fit(self, start: Start | None = None) -> AnyFit:
         """Estimate from one start."""
         if not isinstance(start, Start | None):

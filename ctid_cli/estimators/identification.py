@@ -41,6 +41,7 @@ from ctid_cli.inference.response_test import ResponseTest, response_test
 from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAWS, UNSAFE, Covariance, Progress, Uncertainty, shifts_of_ends
 from ctid_cli.models.several_inputs import delays_of
+from ctid_cli.processors import one_thread
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.record import Record, common_samples
 from ctid_cli.text import Shown
@@ -283,6 +284,7 @@ class Identification(DeferredFields, FittedModel, Shown):
         return self.answer.seen and any(item.status == "free" for item in self.estimates)
 
 
+@one_thread
 def identify(
     options: Options,
     records: Sequence[Record],

@@ -17,6 +17,7 @@ from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.sensitivities import Parametric, Structure
 from ctid_cli.models.several_inputs import delays_of
+from ctid_cli.processors import one_thread
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, Offset
 
@@ -58,6 +59,7 @@ class ModelOnRecord:
     tests: ResidualTests | None = field(repr=False)
 
 
+@one_thread
 def compare(
     fits: Sequence[FittedModel],
     record: Record,

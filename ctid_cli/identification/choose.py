@@ -33,6 +33,7 @@ from ctid_cli.identification.remedies import harmful_outliers, without_samples
 from ctid_cli.inference.input_response import analyse_response
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.models.several_inputs import delays_of
+from ctid_cli.processors import one_thread
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record, as_records
 from ctid_cli.signals.treatment import Holds
@@ -50,6 +51,7 @@ MUCH_NARROWER = 0.5
 TIE = 1e-3
 
 
+@one_thread
 def choose(records: Record | Sequence[Record], given: Given | None = None, time_unit: str = "s") -> Choice:
     """Choose those parts of a model's structure and of the treatment of its records that are not given.
 

@@ -13,10 +13,12 @@ from ctid_cli.identification.choose import choose
 from ctid_cli.identification.fit_warnings import with_warnings
 from ctid_cli.identification.validation import laid_out_for, validated_on
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress
+from ctid_cli.processors import one_thread
 from ctid_cli.signals.record import Record, as_records
 from ctid_cli.text import listed
 
 
+@one_thread
 def identify(
     records: Record | Sequence[Record],
     options: Options | Given | None = None,

@@ -13,10 +13,12 @@ from ctid_cli.identification.remedies import DECISIVE
 from ctid_cli.inference.criteria import information_criteria, r_t_squared, young_information_criterion
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.response_test import LEVEL, ResponseTest
+from ctid_cli.processors import one_thread
 from ctid_cli.signals.frequency_data import FrequencyData
 from ctid_cli.text import count, probability
 
 
+@one_thread
 def identify_frequency_response(data: FrequencyData, options: FrequencyDomain | FrequencyDomainSum) -> Identification:
     """Fit a model to a frequency response and assess it.
 

@@ -21,6 +21,7 @@ from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, factored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction, cancelled
+from ctid_cli.processors import one_thread
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.noise import ArmaNoise, Noise
 from ctid_cli.signals.record import Enters, Record
@@ -229,6 +230,7 @@ def finite_record_covariance(psi: Array, autocovariances: ArrayLike, weights: Ar
     return sandwich(inverse, scale, scaled.T @ coloured)
 
 
+@one_thread
 def cramer_rao_bound(
     model: TransferFunction,
     record: Record,

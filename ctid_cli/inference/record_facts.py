@@ -22,6 +22,7 @@ from ctid_cli.inference.response_test import LEVEL as NO_RESPONSE
 from ctid_cli.inference.response_test import response_test
 from ctid_cli.inference.signal_features import InputMoves, growth_time, input_moves, outliers, quantum, saturated
 from ctid_cli.inference.spectral_methods import find_period
+from ctid_cli.processors import one_thread
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
@@ -135,6 +136,7 @@ class RecordFacts:
         return not self.output_deviation > CONSTANT * abs(self.output_mean)
 
 
+@one_thread
 def record_facts(record: Record) -> RecordFacts:
     """Return the facts about a record.
 

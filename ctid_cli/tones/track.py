@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.flags import Flag
+from ctid_cli.processors import one_thread
 from ctid_cli.signals.checks import require_integer, require_positive
 from ctid_cli.tones import constants as c
 from ctid_cli.tones.check import Readings
@@ -174,6 +175,7 @@ class Track:
         return replace(self, flags=np.where(coarse, kept | np.uint16(Flag.INACCURATE), kept).astype(np.uint16))
 
 
+@one_thread
 def track(
     record: Sampled,
     tones: int | None = None,
