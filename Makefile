@@ -1,5 +1,6 @@
 # make demo       install into .venv, run the quickstart, print its table
-# make test       everything that CI runs
+# make test       what everybody runs before a commit: lint, types, layers, tests without those marked slow
+# make test-slow  the tests marked slow: long runs, choices of a structure on many records, everything in documentation
 # make reproduce  all studies from their specifications, published with their claims; stop it and run it again at will, it
 #                 goes on where it was; with RUNS=20 fewer data sets, which are checked and not published
 # make reproduce-small
@@ -20,29 +21,43 @@ VERSIONS ?= pinned
 
 VENV := .venv
 BIN := $(VENV)/bin
-# Python compiles what it imports; pip would compile every module of every dependency, one after the other.
+# Bytecode is compiled by both processors after the installation, instead of by pip with one. Where
+# PYTHONDONTWRITEBYTECODE is set, as in many containers, every process would compile all that it imports again: a command
+# takes half of its time for that.
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
+COMPILE := $(BIN)/python -m compileall -q -j 0
+BYTECODE := $(COMPILE) -x '/tests?/' $(VENV)/lib ctid_cli
+# One thread each: the threads of two workers wait for each other.
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --dist loadfile --no-loadscope-reorder --durations 5
 
-.PHONY: demo test types pytest reproduce reproduce-small docs scoreboard release-check bench clean
+.PHONY: demo test test-slow types kernels pytest reproduce reproduce-small docs scoreboard release-check bench clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
 	$(BIN)/ctid run configs/quickstart.yaml
 	$(BIN)/ctid table quickstart
 
-# mypy uses one processor, and so do the last of the tests: together they take less time than one after the other.
+# mypy uses one processor, and so does the compilation of kernels: together they take less time.
 test: $(VENV)/.test-installed
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/lint-imports
-	@$(MAKE) --no-print-directory --jobs=2 types pytest
+	@$(MAKE) --no-print-directory --jobs=2 types kernels
+	@$(MAKE) --no-print-directory pytest
 
 types: $(VENV)/.test-installed
 	$(BIN)/mypy
 
-# One thread each: the threads of two workers wait for each other, and tests of frequencies took 3 to 5 times as long.
+# Otherwise every worker of the tests would compile most of them.
+kernels: $(VENV)/.test-installed
+	$(COMPILE) ctid_cli experiments tests
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.compile_kernels
+
 pytest: $(VENV)/.test-installed
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
+
+test-slow: kernels
+	$(PYTEST) -m slow
 
 reproduce: $(VENV)/.installed
 	$(BIN)/ctid reproduce $(if $(RUNS),--runs $(RUNS)) --jobs $(JOBS) --out "$(OUT)"
@@ -72,14 +87,17 @@ clean:
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) -e .
+	-$(BYTECODE)
 	@touch $@
 
 $(VENV)/.test-installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) -e '.[test]'
+	-$(BYTECODE)
 	@touch $@ $(VENV)/.installed
 
 $(VENV)/.docs-installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) -e '.[docs]'
+	-$(BYTECODE)
 	@touch $@ $(VENV)/.installed
