@@ -1,4 +1,4 @@
-"""Compile the kernels that the tests call, before the workers of the tests start: each of them would compile them again.
+"""Compile the kernels that the tests call before their workers start: each of them would compile most of them.
 
 ``python -m tests.compile_kernels`` stores them in the package's cache, from which all later processes load them.
 """
