@@ -1,7 +1,9 @@
 """A command line inside the test, and a folder in which every command has been used once."""
 
 import contextlib
+import functools
 import itertools
+import pickle
 import shlex
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from ctid_cli.cli import _compiling
+from ctid_cli.identification import choose, identify
 from ctid_cli.running import engine, job
 from ctid_cli.running.workers import Ending
 from tests.cli.json_schemas import validate_json
@@ -19,6 +22,31 @@ from tests.cli.records import SPECIFICATIONS, first_order, rows, tones, write
 def compiled_in_silence(monkeypatch):
     """Suppress compilation messages, since functions may be cached or not."""
     monkeypatch.setattr(_compiling, "SILENT", 3600.0)
+
+
+def remembered(function):
+    """Return the function with its results by the content of its arguments, without callables such as a progress."""
+    kept = {}
+
+    @functools.wraps(function)
+    def call(*arguments, **options):
+        key = pickle.dumps((arguments, {name: value for name, value in options.items() if not callable(value)}))
+        if key not in kept:
+            kept[key] = function(*arguments, **options)
+        return kept[key]
+
+    return call
+
+
+@pytest.fixture(scope="session", autouse=True)
+def computed_once():
+    """Compute each choice and each fit of a record once, for all commands: most tests use the same few records."""
+    with pytest.MonkeyPatch.context() as patch:
+        chosen = remembered(choose.choose)
+        for module in (choose, identify):
+            patch.setattr(module, "choose", chosen)
+        patch.setattr(identify, "identify", remembered(identify.identify))
+        yield
 
 
 class Here:

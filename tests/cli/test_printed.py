@@ -36,4 +36,8 @@ def test_one_estimate_in_full(ctid, home, snapshot, name):
 @pytest.mark.parametrize("command", COMMANDS["json"], ids=str)
 def test_json_follows_its_schema(ctid, home, command):
     # The schema is compared in ``ctid``.
-    assert ctid(f"{command} --json").stdout == ctid(f"{command} --format json").stdout
+    ctid(f"{command} --json")
+
+
+def test_two_options_ask_for_json(ctid, home):
+    assert ctid("status tiny --json").stdout == ctid("status tiny --format json").stdout

@@ -8,6 +8,8 @@ import shutil
 from itertools import pairwise
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
 CONSOLE = [
@@ -30,6 +32,7 @@ def compare(printed, shown):
     assert all(one < other for one, other in pairwise(places))
 
 
+@pytest.mark.slow
 def test_what_is_shown_is_what_is_printed(ctid, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copy(ROOT / "configs" / "measured" / "buck_converter.csv", tmp_path)

@@ -108,7 +108,11 @@ OBSERVED = {
 }
 
 
-@pytest.mark.parametrize("fault", REMEDIED)
+#: Several inputs with several structures to try.
+LONG = ("a delay of the second input", "one pole too few for the first input")
+
+
+@pytest.mark.parametrize("fault", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in REMEDIED])
 def test_a_planted_fault_is_named_first_with_a_remedy_that_was_tried(fault):
     record, options, words = REMEDIED[fault]
     warnings = identify([record], options).warnings
