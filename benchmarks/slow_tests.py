@@ -1,7 +1,7 @@
 """Processor time of the tests, and the unmarked ones that take too much of it.
 
-python benchmarks/bench_tests.py                 # the tests of `make test`
-python benchmarks/bench_tests.py -m slow         # those of `make test-slow`; other options of pytest likewise
+python benchmarks/slow_tests.py                 # the tests of `make test`
+python benchmarks/slow_tests.py -m slow         # those of `make test-slow`; other options of pytest likewise
 
 Times are user and system time of the process and of its ended children, also in units of the loop
 ``[i*i for i in range(5_000_000)]``, since machines differ in speed. A file's first test includes its imports and shared
@@ -52,7 +52,7 @@ def pytest_runtest_protocol(item, nextitem):
 def main():
     """Run the tests and print the table."""
     with tempfile.TemporaryDirectory() as folder:
-        words = ["-q", "-n", "logical", "--dist", "loadfile", "--no-loadscope-reorder", "-p", "benchmarks.bench_tests"]
+        words = ["-q", "-n", "logical", "--dist", "loadfile", "--no-loadscope-reorder", "-p", "benchmarks.slow_tests"]
         environment = os.environ | {"CTID_TEST_TIMES": folder, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": "."}
         before, begun, cpu = loop(), time.monotonic(), used()
         done = subprocess.run([sys.executable, "-m", "pytest", *words, *sys.argv[1:]], env=environment)
