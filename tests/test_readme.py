@@ -46,6 +46,7 @@ def test_it_is_short():
     assert len(blocks("yaml")[0].splitlines()) <= 12
 
 
+@pytest.mark.slow
 def test_the_commands_write_what_the_python_example_reads(printed):
     folder, outputs = printed
     assert {words.split()[0] for words in outputs} == {"init", "check", "fit", "report", "run", "table"}
@@ -53,6 +54,7 @@ def test_the_commands_write_what_the_python_example_reads(printed):
     assert (folder / "fit.html").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_table_is_the_one_shown(printed):
     """Processor times differ, and an estimate at the limit of the success rule may differ on another processor."""
     shown = blocks("text")[1].splitlines()
@@ -64,6 +66,7 @@ def test_the_table_is_the_one_shown(printed):
         assert abs(percent - wanted) <= 10
 
 
+@pytest.mark.slow
 def test_the_python_example_prints_what_is_shown(printed):
     with contextlib.chdir(printed[0]), contextlib.redirect_stdout(io.StringIO()) as out:
         exec(blocks("python")[0], {})

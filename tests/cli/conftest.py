@@ -5,6 +5,7 @@ import functools
 import itertools
 import pickle
 import shlex
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,6 +48,17 @@ def computed_once():
             patch.setattr(module, "choose", chosen)
         patch.setattr(identify, "identify", remembered(identify.identify))
         yield
+
+
+@pytest.fixture
+def few_candidates(monkeypatch):
+    """Let ``ctid check`` choose the fit that it suggests among few structures."""
+    whole = choose.choose
+
+    def chosen(records, given, unit):
+        return whole(records, replace(given, poles=(1, 2), zeros=0, integrators=0), unit)
+
+    monkeypatch.setattr(choose, "choose", chosen)
 
 
 class Here:

@@ -11,6 +11,9 @@ from tests.cli.records import write
 NAMED = ("--input", "valve", "--output", "level")
 
 
+pytestmark = pytest.mark.usefixtures("few_candidates")
+
+
 @pytest.fixture
 def arrays():
     rng = np.random.default_rng(0)

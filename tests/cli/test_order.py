@@ -33,6 +33,7 @@ def test_table_and_files(ctid, record, tmp_path, monkeypatch, snapshot):
     assert (tmp_path / "new" / "order.svg").read_bytes().startswith(b"<?xml")
 
 
+@pytest.mark.slow
 def test_sums_of_submodels(ctid, tmp_path, snapshot, monkeypatch):
     """Two modes are found as two, and the recommendation is a command of ctid fit."""
     monkeypatch.chdir(tmp_path)

@@ -52,7 +52,10 @@ def test_the_page_of_a_study_has_its_tables_and_figures(ctid, tmp_path):
 
 @pytest.mark.parametrize(
     ("command", "name"),
-    [("fit record.csv --poles 1 --delay 0.3 --report", "fit"), ("track tones.csv --tones 2", "track")],
+    [
+        ("fit record.csv --poles 2 --zeros 0 --integrators 0 --delay 0.73 --report", "fit"),
+        ("track tones.csv --tones 2", "track"),
+    ],
 )
 def test_the_page_of_a_file_is_the_same_when_its_record_has_moved(ctid, home, tmp_path, command, name):
     record = tmp_path / command.split()[1]

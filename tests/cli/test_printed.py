@@ -34,7 +34,7 @@ def test_one_estimate_in_full(ctid, home, snapshot, name):
 
 
 @pytest.mark.parametrize("command", COMMANDS["json"], ids=str)
-def test_json_follows_its_schema(ctid, home, command):
+def test_json_follows_its_schema(ctid, home, few_candidates, command):
     # The schema is compared in ``ctid``.
     ctid(f"{command} --json")
 

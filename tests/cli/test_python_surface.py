@@ -74,8 +74,8 @@ def test_results_are_those_of_the_commands(out, ctid, tmp_path):
 
 def test_a_fit_is_shown_as_by_the_command(ctid, tmp_path):
     record = write(tmp_path / "record.csv", rows())
-    printed = ctid("fit --poles 1 --out", tmp_path, record).stdout
-    found = identify(read_record(record), Given(poles=1))
+    printed = ctid("fit --poles 2 --zeros 0 --integrators 0 --out", tmp_path, record).stdout
+    found = identify(read_record(record), Given(poles=2, zeros=0, integrators=0))
     assert found.summary().split("\n\n")[3:5] == printed.split("\n\n")[3:5]
     assert len(found.plot().axes) == 4
     assert found._repr_html_().count("<table") == 4
@@ -88,7 +88,7 @@ def test_a_fit_is_shown_as_by_the_command(ctid, tmp_path):
     frame = fit.to_frame()
     assert frame["estimate"].to_dict() == fit.parameters
     assert frame["standard_error"].to_dict() == fit.standard_errors
-    assert list(frame["unit"])[:3] == ["1/s", "out/in/s", "s"]
+    assert list(frame["unit"])[:4] == ["1/s", "1/s^2", "out/in/s^2", "s"]
     assert f"fit {fit.fit_percent:.5g} % of {fit.count} samples" in fit.summary()
     assert fit._repr_html_().count("<tr>") == 1 + len(fit.parameters)
     with pytest.raises(CtidError, match=r"a single MeasuredFit does not hold the record .* identify\("):

@@ -39,6 +39,7 @@ def cluster() -> Iterator[Any]:
         yield made
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_bytes_of_one_machine_though_a_worker_is_killed(cluster: Any, tmp_path: Path) -> None:
     killed: list[int] = []
 
