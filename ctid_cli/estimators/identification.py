@@ -41,6 +41,7 @@ from ctid_cli.inference.response_test import ResponseTest, response_test
 from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAWS, UNSAFE, Covariance, Progress, Uncertainty, shifts_of_ends
 from ctid_cli.models.several_inputs import delays_of
+from ctid_cli.progress import reported
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.record import Record, common_samples
 from ctid_cli.text import Shown
@@ -283,6 +284,7 @@ class Identification(DeferredFields, FittedModel, Shown):
         return self.answer.seen and any(item.status == "free" for item in self.estimates)
 
 
+@reported("fitting the model")
 def identify(
     options: Options,
     records: Sequence[Record],
@@ -337,6 +339,7 @@ def identify(
     )
 
 
+@reported("tests of the residuals")
 def tests_of(options: Options, fit: MeasuredFit, records: Sequence[Record]) -> tuple[ResidualTests, ...]:
     """Return the tests of each experiment, at levels with the false-alarm probability of a single one.
 

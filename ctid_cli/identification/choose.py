@@ -33,6 +33,7 @@ from ctid_cli.identification.remedies import harmful_outliers, without_samples
 from ctid_cli.inference.input_response import analyse_response
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.models.several_inputs import delays_of
+from ctid_cli.progress import reported
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record, as_records
 from ctid_cli.signals.treatment import Holds
@@ -50,6 +51,7 @@ MUCH_NARROWER = 0.5
 TIE = 1e-3
 
 
+@reported("choosing the structure")
 def choose(records: Record | Sequence[Record], given: Given | None = None, time_unit: str = "s") -> Choice:
     """Choose those parts of a model's structure and of the treatment of its records that are not given.
 
@@ -169,6 +171,7 @@ class _Choosing:
 
     # --- the range of the delay ------------------------------------------------------------------------
 
+    @reported("range of the delay")
     def _delays(self) -> tuple[tuple[float, float], float]:
         """Return the range of the delay, and how far it may be extended [s]."""
         given, several = self.given.delays_given, self.part[0].several
@@ -207,6 +210,7 @@ class _Choosing:
 
     # --- state, offset and hold ------------------------------------------------------------------------
 
+    @reported("state, offset and hold")
     def _setting(self, span: Span, delays: tuple[float, float], near: Known | None = None) -> Setting:
         """Return the best state, offset and hold with structures of a span; searches start at known models."""
         self.reasons, near = [], near or self.known

@@ -19,6 +19,7 @@ from ctid_cli.inference.spectral_methods import (
     local_polynomial,
     welch,
 )
+from ctid_cli.progress import reported
 from ctid_cli.signals.checks import require_choice, require_integer
 from ctid_cli.signals.frequency_data import FrequencyData, held_data
 from ctid_cli.signals.held import REGULARITY, Hold, hold_factor
@@ -209,6 +210,7 @@ class FrequencyResponse:
         return np.asarray(stdtrit(2 * self.freedom, 0.5 + level / 2) * np.sqrt(0.5 * self.variance))
 
 
+@reported("frequency response")
 def estimate_frequency_response(
     records: Record | Sequence[Record],
     *,
