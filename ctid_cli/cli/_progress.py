@@ -233,7 +233,7 @@ class RunReport:
         done, total = progress.done, progress.total
         speed = done / max(time.monotonic() - self._begun, 1e-9)
         note = f"{rate(speed)}, {progress.failed} failed"
-        report("data set", done, total, f"{note}, ETA {seconds((total - done) / speed)}" if done else note)
+        report("data set", done, total, f"{note}, ETA {seconds((total - done) / speed)}" if 0 < done < total else note)
         if progress.stored and done == total:
             self._say(f"{done}/{total} data sets, {note}")
 
