@@ -1,4 +1,4 @@
-"""Progress of computations: the steps that are in progress, for whoever listens.
+"""Progress of computations: the steps that are in progress, reported to listeners.
 
 Computations report their steps; without a listener that costs a fraction of a microsecond. To see them from Python:
 

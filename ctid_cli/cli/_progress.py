@@ -43,7 +43,8 @@ class Display:
 
     def __init__(self, name: str, steps: Steps) -> None:
         self._name, self._steps, self._stream = name, steps, sys.stderr
-        self._live = self._stream.isatty() and os.environ.get("TERM") != "dumb"
+        # There is no stream if the caller has closed it.
+        self._live = self._stream is not None and self._stream.isatty() and os.environ.get("TERM") != "dumb"
         self._begun = time.monotonic()
         self._due = self._begun + SILENT
         self._shown, self._started = "", False
@@ -62,8 +63,8 @@ class Display:
                 if not isinstance(sys.stderr, _Clearing):
                     sys.stdout, sys.stderr = _Clearing(sys.stdout, self), _Clearing(sys.stderr, self)
                 line = f"{self._name}: {text}"
-                room = shutil.get_terminal_size().columns - len(passed) - 1
-                line = line if len(line) <= room else f"{line[: room - 1]}…"
+                width = shutil.get_terminal_size().columns - len(passed) - 1
+                line = line if len(line) <= width else f"{line[: width - 1]}…"
                 self._shown = line
                 self._put(f"\r{line}{passed}\x1b[K")
             elif text != self._shown:
@@ -84,7 +85,7 @@ class Display:
             sys.stdout, sys.stderr = sys.stdout.stream, sys.stderr.stream
 
     def _put(self, text: str) -> None:
-        with suppress(OSError, ValueError):
+        with suppress(OSError, ValueError, AttributeError):
             self._stream.write(text)
             self._stream.flush()
 

@@ -8,17 +8,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ctid_cli.cli import _progress
 from ctid_cli.running import engine, job
 from ctid_cli.running.workers import Ending
 from tests.cli.json_schemas import validate_json
 from tests.cli.records import SPECIFICATIONS, first_order, rows, tones, write
-
-
-@pytest.fixture(autouse=True)
-def in_silence(monkeypatch):
-    """Suppress progress, since the machine may be slow."""
-    monkeypatch.setattr(_progress, "SILENT", 3600.0)
 
 
 class Here:
@@ -71,7 +64,6 @@ def used(tmp_path_factory, ctid):
     folder = tmp_path_factory.mktemp("used")
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
         patch.setattr(engine, "LocalWorkers", Here)
-        patch.setattr(_progress, "SILENT", 3600.0)
         # Every estimate takes ten milliseconds, on every machine.
         ticks = itertools.count()
         patch.setattr(job, "_clocks", lambda: np.full(2, 0.01 * next(ticks)))

@@ -94,7 +94,7 @@ def test_lines_in_a_log_file_two_seconds_after_the_start_and_ten_after_the_last(
     assert stream.getvalue() == "ctid fit: b (2 s)\nctid fit: e (13 s)\n"
 
 
-def test_a_line_on_a_terminal_is_cut_and_makes_room_for_other_output(shown, monkeypatch):
+def test_a_line_on_a_terminal_is_cut_and_precedes_other_output(shown, monkeypatch):
     stream, output = Terminal(), io.StringIO()
     monkeypatch.setattr(sys, "stdout", output)
     display = shown(stream, (1.0, "a"), (2.0, "b"), (3.0, "c" * 99))
