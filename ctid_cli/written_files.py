@@ -20,6 +20,9 @@ _DEVICES = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)", re.IGNORECAS
 _SHARD = re.compile(r"\.shard-\d+-of-\d+$")
 _TEMPORARY = ".tmp"
 _numbers = itertools.count(1)
+#: Files that this process has completely written, and those that it is writing.
+written: list[Path] = []
+_unfinished: set[Path] = set()
 
 
 def write_file(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:
@@ -31,6 +34,7 @@ def write_file(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:
         _write(path, data)
         return
     temporary = path.with_name(f".{path.name[:40]}-{os.getpid()}-{next(_numbers)}{_TEMPORARY}")
+    _unfinished.add(temporary)
     try:
         # Never write to a file of another program.
         temporary.touch(exist_ok=False)
@@ -38,16 +42,25 @@ def write_file(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:
         if before is not None:
             temporary.chmod(stat.S_IMODE(before))
         temporary.replace(path)
+        written.append(path)
     except BaseException:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        remove_unfinished()
         raise
+    finally:
+        _unfinished.discard(temporary)
     descriptor = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
         with suppress(OSError):
             os.close(descriptor)
+
+
+def remove_unfinished() -> None:
+    """Remove the files that this process is writing, before it ends."""
+    for path in [*_unfinished]:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def _write(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:

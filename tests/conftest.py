@@ -2,6 +2,11 @@
 
 from hypothesis import settings
 
+from ctid_cli.cli import _progress
+
+# Commands in tests say nothing of their progress, however slow the machine is.
+_progress.SILENT = 3600.0
+
 # No deadline, since the first call of a compiled kernel takes seconds; derandomised, since a test that fails only
 # sometimes does not show which change caused the failure.
 settings.register_profile("ctid", derandomize=True, deadline=None, max_examples=50)

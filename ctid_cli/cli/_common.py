@@ -22,7 +22,9 @@ from typer.core import TyperArgument, TyperCommand
 
 from ctid_cli.canonical import plain
 from ctid_cli.cli._options import flag, with_option_groups
+from ctid_cli.cli._progress import Watch, interruptible
 from ctid_cli.errors import CtidError, ExitCode, RefusedError, SpecError, StorageError, UsageError
+from ctid_cli.progress import reported
 from ctid_cli.reporting.document import Format, Result
 from ctid_cli.written_files import write_file
 
@@ -56,7 +58,7 @@ _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
 
 
 class Command(TyperCommand):
-    """A command that refuses an option given twice, as only its last value would count."""
+    """A command that shows its progress, and refuses an option given twice, as only its last value would count."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the help of arguments and options; the names of arguments say what they are, without a type."""
@@ -78,17 +80,9 @@ class Command(TyperCommand):
             error.message = said.replace("Input should be greater than or equal to", "must be at least")
             raise
 
-
-class ComputingCommand(Command):
-    """A command that announces when it waits for compiled functions."""
-
     def invoke(self, ctx: Any) -> Any:
-        """Run the command."""
-        from numba.core import event
-
-        from ctid_cli.cli._compiling import CompilationNotice
-
-        with event.install_listener("numba:compile", CompilationNotice()):
+        """Run the command, show what it does if it takes long, and end it after Ctrl-C."""
+        with Watch(str(ctx.info_name), quiet=bool(ctx.params.get("quiet"))):
             return super().invoke(ctx)
 
 
@@ -124,6 +118,7 @@ def span(text: str, number: Callable[[str], Number]) -> tuple[Number, Number] | 
         return None
 
 
+@reported("writing the result")
 def emit(result: Result, form: Format, written: Sequence[Path] = (), stored: str | None = None) -> None:
     """Print a result in the requested form, JSON as it was stored, and name the written files."""
     names = list(map(str, written))
@@ -183,13 +178,12 @@ def guarded(function: Function) -> Function:
     @functools.wraps(command)
     def wrapper(*args: Any, **kwargs: Any) -> None:
         try:
-            command(*args, **kwargs)
+            with interruptible():
+                command(*args, **kwargs)
         except CtidError as error:
             # Problems of a specification begin with file:line:column, which editors turn into links.
             typer.echo(printable(str(error) if isinstance(error, SpecError) else f"ctid: {error}"), err=True)
             raise typer.Exit(error.exit_code) from None
-        except KeyboardInterrupt:
-            raise typer.Exit(ExitCode.INTERRUPTED) from None
         except (typer.Exit, typer.Abort, BrokenPipeError):
             raise
         except OSError as error:

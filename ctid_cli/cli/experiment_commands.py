@@ -34,8 +34,9 @@ from ctid_cli.cli._common import (
     write_files,
 )
 from ctid_cli.cli._options import FormatOptions, flag
-from ctid_cli.cli._progress import Reporter
+from ctid_cli.cli._progress import RunReport
 from ctid_cli.errors import ExitCode, Problem, RefusedError, SpecError, TooManyFailuresError, UsageError
+from ctid_cli.progress import doing
 from ctid_cli.reporting.layout import seconds
 from ctid_cli.text import count, did_you_mean, listed
 
@@ -199,8 +200,9 @@ def _run_all(
     for plan, folder in zip(plans, folders, strict=True):
         left = None if ends is None else max(ends - time.monotonic(), 0.0)
         stop = StopRequest(failures=end.max_failures, seconds=left)
-        with Reporter(plan.experiment, quiet=quiet) as reporter:
-            summary = run_experiment(plan, folder, stop=stop, progress=reporter, **how)
+        with doing(plan.experiment):
+            told = RunReport(plan.experiment, quiet=quiet)
+            summary = run_experiment(plan, folder, stop=stop, progress=told, **how)
         if not quiet:
             typer.echo(_conclusion(summary, place.out, part))
         if changed := _changed(plan, summary):

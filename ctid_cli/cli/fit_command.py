@@ -12,11 +12,11 @@ import typer
 
 from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwriting, write_files
 from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag
-from ctid_cli.cli._progress import FitProgress
 from ctid_cli.cli.fit_structure import FitOptions, ModelRequest, as_usage_errors
 from ctid_cli.cli.loop_options import LoopOptions, without_delay
 from ctid_cli.cli.response_fit import frequency_files, frequency_fit
 from ctid_cli.errors import UsageError
+from ctid_cli.progress import reported
 from ctid_cli.reporting.document import Tool
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ class WritingOptions:
     export: Annotated[Tool | None, flag("--export", "Write the model as code for this tool.")] = None
     out: Annotated[Path, flag("--out", "Folder for fit.json and fit.svg.", "DIR")] = Path(".")
 
+    @reported("preparing the files")
     def contents(self, result: FitResult, command: str) -> dict[Path, bytes]:
         """Return the contents of the files by path; the first is the fit itself."""
         from ctid_cli.reporting.column_file import frame_bytes
@@ -116,7 +117,7 @@ def fit(
 def _fit_of_records(
     files: list[Path], request: ModelRequest, columns: RecordOptions, assessment: AssessmentOptions
 ) -> FitResult:
-    """Fit a model to records in time, with a progress bar if it takes long."""
+    """Fit a model to records in time."""
     from ctid_cli.identification.identify import identify
     from ctid_cli.reporting.fit_result import FitResult
 
@@ -134,7 +135,7 @@ def _fit_of_records(
     if request.single and request.options.common("delay_bounds") is None:
         records = records.treated(without_delay)
     assessment.check(noise, {record.name: record.n_samples for record in records.all})
-    with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)) as progress:
-        draws = assessment.draws | {"progress": progress, "time_unit": records.units.time}
+    with as_usage_errors():
+        draws = assessment.draws | {"time_unit": records.units.time}
         found = identify(records.data, estimator, records.validation_record, **draws)
     return FitResult(found, records.of_fit(found), assessment.predict)

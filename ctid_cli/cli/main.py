@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 import ctid_cli
-from ctid_cli.cli._common import Command, ComputingCommand
+from ctid_cli.cli._common import Command
+from ctid_cli.cli._progress import Watch
 from ctid_cli.cli.experiment_commands import accuracy, init, run, schema, validate
 from ctid_cli.cli.fit_command import fit
 from ctid_cli.cli.order_command import order
@@ -48,18 +49,17 @@ def _root(
     """
 
 
-# Commands that show or move stored results do not wait for Numba.
-_STORED = (status, export, verify, merge, init)
 _RESULTS = (status, table, figure, report, export, verify)
 _RECORDS = (check, fit, compare, order, frf, track)
 for _command in (*_RECORDS, init, run, reproduce, merge, *_RESULTS, validate, accuracy, schema):
-    app.command(cls=Command if _command in _STORED else ComputingCommand)(_command)
+    app.command(cls=Command)(_command)
 
 
 def main() -> None:
     """Run the ``ctid`` command."""
     # The matrices are small, so more threads for a product only slow it down. NumPy is not loaded yet.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    Watch.owns_process = True
     app(prog_name="ctid")
 
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 from ctid_cli.canonical import plain
 from ctid_cli.cli._common import emit, guarded, span, write_files
 from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag, given_options, refuse_options
-from ctid_cli.cli._progress import FitProgress
 from ctid_cli.cli.fit_structure import MODES, OPTIONS, FormOption, HoldOption, StructureOptions, as_usage_errors
 from ctid_cli.cli.response_fit import frequency_files
 from ctid_cli.errors import UsageError
@@ -73,7 +72,7 @@ def order(
         )
     given = grid.requested()
     records = columns.read_all(files, validate, "zoh")
-    with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)):
+    with as_usage_errors():
         choice = choose(records.data, given, records.units.time)
         result = OrderSearchResult.of(choice, given, records)
     written = [out / "order.json", out / "order.svg"]

@@ -10,7 +10,6 @@ import typer
 
 from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwriting, write_files
 from ctid_cli.cli._options import FormatOptions, From, TimeColumn, To, flag, positive
-from ctid_cli.cli._progress import RecordProgress
 from ctid_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -65,8 +64,7 @@ class ToneOptions:
             raise UsageError(f"--tones must be a number from 0 to {MOST_TONES}, or auto, not {self.tones!r}")
         tones = None if self.tones == "auto" else int(self.tones)
         try:
-            with RecordProgress(Path(record.file).name) as tell:
-                return follow(record, tones, self.accuracy, self.every, self.window, on_progress=tell)
+            return follow(record, tones, self.accuracy, self.every, self.window)
         except ValueError as error:
             raise UsageError(str(error)) from None
 

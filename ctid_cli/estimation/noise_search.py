@@ -12,6 +12,7 @@ from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import LONG, Begin, Optimum
 from ctid_cli.inference.innovations import NoiseFit, Orders, all_arma, fit_arma, steps_of
+from ctid_cli.progress import reported
 from ctid_cli.signals.noise import ArmaNoise
 
 #: Decrease of ``-2 ln L`` per round that counts as convergence; largest number of rounds.
@@ -41,6 +42,7 @@ class JointOptimum(NamedTuple):
     noise: NoiseFit
 
 
+@reported("noise model")
 def joint_optimum(
     measured: MeasuredRecords,
     found: Optimum,

@@ -42,6 +42,7 @@ from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAWS, UNSAFE, Covariance, Progress, Uncertainty, shifts_of_ends
 from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.processors import one_thread
+from ctid_cli.progress import reported
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.record import Record, common_samples
 from ctid_cli.text import Shown
@@ -285,6 +286,7 @@ class Identification(DeferredFields, FittedModel, Shown):
 
 
 @one_thread
+@reported("fitting the model")
 def identify(
     options: Options,
     records: Sequence[Record],
@@ -339,6 +341,7 @@ def identify(
     )
 
 
+@reported("tests of the residuals")
 def tests_of(options: Options, fit: MeasuredFit, records: Sequence[Record]) -> tuple[ResidualTests, ...]:
     """Return the tests of each experiment, at levels with the false-alarm probability of a single one.
 

@@ -34,9 +34,10 @@ from ctid_cli.inference.fit import Status
 from ctid_cli.inference.loop_noise import SensitivityFunction
 from ctid_cli.inference.noise_estimate import orders_of
 from ctid_cli.inference.sensitivities import Structure
-from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
+from ctid_cli.inference.uncertainty import DRAW, DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.controller import ContinuousController, DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.progress import calling
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Loop, Record, as_records, named
 from ctid_cli.signals.treatment import LossKind
@@ -87,15 +88,9 @@ class LoopFit(MeasuredFit):
         if loop is not None:
             each = zip(psi, errors, self.used, strict=True)
             psi, errors = zip(*(loop.completed(*one) for one in each), strict=True)
-        found = estimate_uncertainty(
-            psi,
-            errors,
-            "robust" if kind == "auto" else kind,
-            draws,
-            tangent=self.tangent,
-            loop=loop,
-            progress=progress,
-        )
+        kind = "robust" if kind == "auto" else kind
+        with calling(progress, DRAW):
+            found = estimate_uncertainty(psi, errors, kind, draws, tangent=self.tangent, loop=loop)
         return found if self.status in DETERMINED else found.undefined
 
 

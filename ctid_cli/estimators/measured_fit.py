@@ -26,8 +26,9 @@ from ctid_cli.inference.innovations import NoiseFit
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_covariance, orders_of
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
-from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
+from ctid_cli.inference.uncertainty import DRAW, DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of
+from ctid_cli.progress import calling
 from ctid_cli.signals.noise import ArmaNoise
 
 
@@ -137,9 +138,8 @@ class MeasuredFit(DeferredFields, Fit):
             Covariance, and quantiles of the intervals.
         """
         linear = self.linear
-        found = estimate_uncertainty(
-            linear.sensitivities, linear.residuals, kind, draws, tangent=self.tangent, progress=progress
-        )
+        with calling(progress, DRAW):
+            found = estimate_uncertainty(linear.sensitivities, linear.residuals, kind, draws, tangent=self.tangent)
         return found.in_ignored_loop if self.in_ignored_loop and kind == "auto" else found
 
     def _with_uncertainty(self, kind: Covariance, draws: int) -> Self:

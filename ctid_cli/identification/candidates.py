@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ctid_cli import progress
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import Optimum, best_near, best_of_orders
@@ -282,7 +283,7 @@ class SmallModels:
 
     def compared(self, settings: Sequence[Setting]) -> Ranking:
         """Rank the structures in some settings, which all use the same samples."""
-        found = [each for setting in settings for each in self._fitted(setting)]
+        found = [each for setting in progress.each("setting", settings) for each in self._fitted(setting)]
         if not found:
             raise DataError(f"{named(self.records[0])}too few usable samples for a model's parameters")
         return ranked(found)
@@ -336,6 +337,7 @@ def grid(
     ]
     found: list[Candidate] = []
     for order in range(1, min(span.most_poles, MOST_POLES) + 1):
+        progress.report("order", order, min(span.most_poles, MOST_POLES))
         tried = [each for family in families for each in family.tried(order, span)]
         found += [each for each in tried if each is not None]
         if tried and not any(tried):

@@ -34,6 +34,7 @@ from ctid_cli.inference.input_response import analyse_response
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.processors import one_thread
+from ctid_cli.progress import reported
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record, as_records
 from ctid_cli.signals.treatment import Holds
@@ -52,6 +53,7 @@ TIE = 1e-3
 
 
 @one_thread
+@reported("choosing the structure")
 def choose(records: Record | Sequence[Record], given: Given | None = None, time_unit: str = "s") -> Choice:
     """Choose those parts of a model's structure and of the treatment of its records that are not given.
 
@@ -171,6 +173,7 @@ class _Choosing:
 
     # --- the range of the delay ------------------------------------------------------------------------
 
+    @reported("range of the delay")
     def _delays(self) -> tuple[tuple[float, float], float]:
         """Return the range of the delay, and how far it may be extended [s]."""
         given, several = self.given.delays_given, self.part[0].several
@@ -209,6 +212,7 @@ class _Choosing:
 
     # --- state, offset and hold ------------------------------------------------------------------------
 
+    @reported("state, offset and hold")
     def _setting(self, span: Span, delays: tuple[float, float], near: Known | None = None) -> Setting:
         """Return the best state, offset and hold with structures of a span; searches start at known models."""
         self.reasons, near = [], near or self.known

@@ -19,6 +19,7 @@ from ctid_cli.inference.residual_tests import FEWEST_TESTED, input_dependence
 from ctid_cli.inference.signal_features import growth_time, residual_outliers, saturated
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.several_inputs import delays_of, fractions_of
+from ctid_cli.progress import reported
 from ctid_cli.signals.record import Record
 from ctid_cli.text import count, listed, probability
 
@@ -47,6 +48,7 @@ def with_warnings(found: Identification, time_unit: str = "s") -> Identification
     return replace(found, warnings=tuple(f"{text}." for text in fit_warnings(found, time_unit)))
 
 
+@reported("tests of the fit")
 def fit_warnings(found: Identification, time_unit: str = "s") -> list[str]:
     """Return the warnings of a fit without their full stops, the most important first, and try changes of it."""
     fit, records = found.fit, found.records

@@ -12,6 +12,7 @@ from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.identification.criterion import Candidate, Ranking, in_order
 from ctid_cli.inference.criteria import percent_from_r_squared
+from ctid_cli.progress import reported
 from ctid_cli.signals.record import Record
 
 #: Blocks of all records, each held back once, and groups of blocks that are held back together: the last group has the
@@ -103,6 +104,7 @@ def held_back_errors(options: DelayProfile, records: Sequence[Record], near: Beg
     return errors
 
 
+@reported("structures on held-back samples")
 def without_overfitted(ranking: Ranking, records: Sequence[Record]) -> Ranking:
     """Return structures in order, those last that are too large to predict held-back blocks.
 

@@ -18,6 +18,7 @@ from ctid_cli.identification.changes import CHANGES, Change, FittedOptions, Kind
 from ctid_cli.identification.criterion import Errors, criteria_of
 from ctid_cli.identification.held_back import compared, long_enough
 from ctid_cli.inference.signal_features import residual_outliers
+from ctid_cli.progress import reported
 from ctid_cli.signals.record import Record, beginning
 from ctid_cli.signals.treatment import Holds
 
@@ -78,6 +79,7 @@ class Helpful(NamedTuple):
     changed: FittedOptions
 
 
+@reported("remedies")
 def tried_remedies(
     records: Sequence[Record],
     options: Options,
@@ -123,6 +125,7 @@ def tried_remedies(
     return found
 
 
+@reported("outliers")
 def harmful_outliers(records: tuple[Record, ...], options: Options, fit: MeasuredFit) -> list[Array] | None:
     """Return the instants of the outliers of a fit in each record if another loss helps; else None."""
     found, at = Trials([], []), outlier_instants(records, fit)

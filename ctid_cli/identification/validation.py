@@ -13,6 +13,7 @@ from ctid_cli.identification.criterion import Candidate, Errors, Searched, crite
 from ctid_cli.identification.initial_states import states_of
 from ctid_cli.inference import criteria
 from ctid_cli.inference.residual_tests import ResidualTests
+from ctid_cli.progress import reported
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import Offset
 
@@ -66,6 +67,7 @@ def laid_out_for(record: Record, options: Searched, given: Given) -> list[tuple[
     return [(each, laid_out) for each, laid_out in pairs if isinstance(laid_out, MeasuredRecords)]
 
 
+@reported("validation")
 def validated_on(record: Record, options: Searched, fit: MeasuredFit, given: Given) -> Validation:
     """Assess a fixed model on a record, in the treatment that the criterion prefers."""
     tried = laid_out_for(record, options, given)

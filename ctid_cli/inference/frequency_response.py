@@ -20,6 +20,7 @@ from ctid_cli.inference.spectral_methods import (
     welch,
 )
 from ctid_cli.processors import one_thread
+from ctid_cli.progress import reported
 from ctid_cli.signals.checks import require_choice, require_integer
 from ctid_cli.signals.frequency_data import FrequencyData, held_data
 from ctid_cli.signals.held import REGULARITY, Hold, hold_factor
@@ -211,6 +212,7 @@ class FrequencyResponse:
 
 
 @one_thread
+@reported("frequency response")
 def estimate_frequency_response(
     records: Record | Sequence[Record],
     *,

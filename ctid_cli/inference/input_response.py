@@ -11,6 +11,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.inference.intervals import robust_deviation
 from ctid_cli.inference.signal_features import InputMoves, input_moves, outliers
+from ctid_cli.progress import reported
 from ctid_cli.signals.record import Record
 
 #: Share of the power of the response within its band.
@@ -93,6 +94,7 @@ def output_bandwidth(record: Record) -> float:
     return analyse_response(record, moves).bandwidth
 
 
+@reported("response to the input")
 def analyse_response(record: Record, moves: InputMoves | None = None) -> InputResponse:
     """Return band and delay of the response of the output to the input."""
     moves = moves or input_moves(record)

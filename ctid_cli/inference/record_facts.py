@@ -23,6 +23,7 @@ from ctid_cli.inference.response_test import response_test
 from ctid_cli.inference.signal_features import InputMoves, growth_time, input_moves, outliers, quantum, saturated
 from ctid_cli.inference.spectral_methods import find_period
 from ctid_cli.processors import one_thread
+from ctid_cli.progress import reported
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
@@ -137,6 +138,7 @@ class RecordFacts:
 
 
 @one_thread
+@reported("facts of the record")
 def record_facts(record: Record) -> RecordFacts:
     """Return the facts about a record.
 
@@ -192,6 +194,7 @@ def _range(signal: str, x: Array) -> dict[str, Any]:
     return {f"{signal}_{name}": float(value) for name, value in values.items()}
 
 
+@reported("test for a response")
 def _response_p_value(record: Record) -> float:
     """Return the p-value of the test for a response, with the system initially in equilibrium."""
     signal = record.input
@@ -200,6 +203,7 @@ def _response_p_value(record: Record) -> float:
     return test.p_value
 
 
+@reported("offset, drift and outliers")
 def decompose(record: Record) -> Decomposition:
     """Fit the response of a record with a varying input, without outliers, and test the other parts of the output."""
     every = -(-int(np.count_nonzero(record.valid)) // MOST_SAMPLES)
@@ -256,6 +260,7 @@ def sampled_input(record: Record) -> tuple[float, Array]:
     return grid.interval, record.input.at(record.t[0] + grid.interval * (np.arange(grid.u.size) + 1e-6))
 
 
+@reported("order of excitation")
 def excitation_order(interval: float, u: Array, moves: InputMoves, response: InputResponse) -> int:
     """Return the order of persistent excitation, at most 50: the rank of the autocovariance of the input to -40 dB."""
     highest = response.input_band[1]

@@ -9,6 +9,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, IntArray
 from ctid_cli.inference.intervals import robust_deviation
 from ctid_cli.inference.noise_model import fit_noise_model
+from ctid_cli.progress import reported
 from ctid_cli.signals.record import Record
 
 #: An input with at most this number of changes gives single step responses and no averages over frequency.
@@ -34,6 +35,7 @@ class InputMoves:
     noisy: bool = False
 
 
+@reported("changes of the input")
 def input_moves(record: Record) -> InputMoves:
     """Return the changes of the input between the first and the last output sample.
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
 from ctid_cli.errors import DataError
+from ctid_cli.progress import reported
 from ctid_cli.signals.treatment import Hold
 
 #: Number of images on each side in the sum; the others add less than a hundredth of the first.
@@ -255,6 +256,7 @@ class _Periods(NamedTuple):
     number: int
 
 
+@reported("period of the input")
 def find_period(u: Array) -> int | None:
     """Return the period of an input in samples, with at least two periods in the record; None if there is none."""
     n = u.size

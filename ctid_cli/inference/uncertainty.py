@@ -15,12 +15,14 @@ from ctid_cli.inference.loop_noise import SensitivityFunction
 from ctid_cli.inference.noise_model import NoiseModel
 from ctid_cli.inference.residual_tests import all_white
 from ctid_cli.inference.sensitivities import Parametric
+from ctid_cli.progress import report, reported
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record
 
 #: Fixed seed of the noise, for reproducible results.
 SEED = 20140801
-#: Called with the number of finished draws and their total.
+#: Reported step of a bootstrap; and a function that is called with the number of finished draws and their total.
+DRAW = "bootstrap draw"
 Progress = Callable[[int, int], None]
 
 
@@ -49,7 +51,6 @@ def bootstrap_t(
     draws: int,
     *,
     loop: SensitivityFunction | None = None,
-    progress: Progress | None = None,
 ) -> BootstrapT:
     """Draw noise, and estimate from each draw the parameters, to first order, and their covariance.
 
@@ -68,8 +69,7 @@ def bootstrap_t(
         errors[k] = solve @ np.concatenate(drawn)
         left = [v - block @ errors[k] for v, block in zip(drawn, psi, strict=True)]
         covariances[k] = robust_covariance(psi, left, loop)[0]
-        if progress is not None:
-            progress(k + 1, draws)
+        report(DRAW, k + 1, draws)
     return BootstrapT(errors, covariances)
 
 
@@ -161,6 +161,7 @@ class Uncertainty:
         return replace(self, free_covariance=np.full_like(self.free_covariance, np.nan))
 
 
+@reported("standard errors")
 def estimate_uncertainty(
     psi: Sequence[Array],
     residuals: Sequence[Array],
@@ -169,7 +170,6 @@ def estimate_uncertainty(
     *,
     tangent: Array | None = None,
     loop: SensitivityFunction | None = None,
-    progress: Progress | None = None,
 ) -> Uncertainty:
     """Return the uncertainty of an output-error estimate from sensitivities and residuals of each experiment.
 
@@ -188,7 +188,7 @@ def estimate_uncertainty(
         found, noise = robust_covariance(free, residuals, loop)
         effective = noise.effective_count(count)
         if kind == "bootstrap" and np.isfinite(found).all():
-            bootstrap = bootstrap_t(free, noise, draws, loop=loop, progress=progress)
+            bootstrap = bootstrap_t(free, noise, draws, loop=loop)
         kind = "robust" if bootstrap is None else "bootstrap"
     return Uncertainty(kind, basis, found, effective, bootstrap)
 
@@ -198,6 +198,7 @@ def estimate_uncertainty(
 UNSAFE = 0.5
 
 
+@reported("intervals")
 def shifts_of_ends(
     model: Parametric,
     law: Uncertainty,

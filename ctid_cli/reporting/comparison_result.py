@@ -12,6 +12,7 @@ import pandas as pd
 
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.paired import fisher, holm
+from ctid_cli.progress import reported
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.layout import number, percent
 from ctid_cli.reporting.measures import records_of, settings_of
@@ -95,6 +96,7 @@ class ComparisonResult(Result):
         return text
 
 
+@reported("comparing the tables")
 def check_tables(names: Sequence[str], out: Path) -> ComparisonResult:
     """Compare tables of a results folder with the committed ones."""
     file, tables = committed_tables(), build_tables(names, out)

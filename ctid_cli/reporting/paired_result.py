@@ -19,6 +19,7 @@ import pandas as pd
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.monte_carlo import MEASURES
 from ctid_cli.inference.paired import hit_difference, holm, median_difference, rms_difference
+from ctid_cli.progress import reported
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.measures import Row, label_frame, parameter_unit, parts_of, records_of, values_of
@@ -42,6 +43,7 @@ DIFFERENCES = {"percent": hit_difference, "rmse": rms_difference, "cpu": median_
 OWN = ("first", "second", "p_value", "adjusted_p_value", "family", "failed_ids")
 
 
+@reported("comparing the estimators")
 def compare_estimators(results: Results, names: str, out: Path) -> TableResult:
     """Return the differences of two estimators, given as ``A,B``, on their common data sets."""
     first, second = _known_pair(results, names)

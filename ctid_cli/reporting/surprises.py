@@ -13,6 +13,7 @@ import numpy as np
 from ctid_cli.inference.monte_carlo import Measured
 from ctid_cli.inference.monte_carlo_tests import MEASURED, Departure, departures
 from ctid_cli.inference.paired import holm
+from ctid_cli.progress import reported
 from ctid_cli.reporting.layout import delay_label, setting_text, setting_title
 from ctid_cli.reporting.measures import Row, counted_in, label_frame, measure_frame, parts_of, records_of, settings_of
 from ctid_cli.reporting.results import Results, lookup
@@ -49,6 +50,7 @@ class Finding(NamedTuple):
         return str(self.labels["method"])
 
 
+@reported("comparing results with theory")
 def surprises(results: Results) -> list[str]:
     """Return the deviations of estimates of simulated systems from theory, one sentence for each reason."""
     if not results.is_simulated:

@@ -11,6 +11,7 @@ import pandas as pd
 
 from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.inference.monte_carlo import Measure
+from ctid_cli.progress import reported
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.estimate import parameters
 from ctid_cli.reporting.layout import (
@@ -162,6 +163,7 @@ def notes_of(results: Results, out: Any) -> list[str]:
 # --- an experiment --------------------------------------------------------------------------------------------------
 
 
+@reported("computing the table")
 def experiment_table(results: Results, remarks: Sequence[str] = ()) -> TableResult:
     """Return the table of one experiment: percentages, measures, or the estimates of a measured record."""
     if results.settings.get("data") is None and (names := default_measures(results)):
@@ -224,6 +226,7 @@ def _blocks(items: Sequence[Any], size: int) -> list[Sequence[Any]]:
 # --- measures -------------------------------------------------------------------------------------------------------
 
 
+@reported("computing the table")
 def measure_table(results: Results, names: Sequence[str], remarks: Sequence[str] = ()) -> TableResult:
     """Return measures by name, those of parameters in one table, those of estimates in another, failures in a third."""
     frame = measure_frame(results, names).reset_index(drop=True)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ctid_cli import progress
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import BiasedError, CtidError, DataError, UsageError
 from ctid_cli.inference.intervals import normal_quantile
@@ -105,7 +106,8 @@ def expectations(plan: Plan) -> tuple[list[dict[str, Any]], int]:
         text = f"{plan.experiment} is about a measured record, whose true system is not known; "
         raise UsageError(f"{text}its estimates carry their standard errors: ctid fit, or ctid run and ctid table")
     shown = _shown(cells)
-    estimates = [_expectation(cell, source, each, plan) for cell, source in shown for each in plan.estimators]
+    pairs = [(*one, each) for one in shown for each in plan.estimators]
+    estimates = [_expectation(*one, plan) for one in progress.each("standard errors", pairs)]
     return estimates, len(cells) - len(shown)
 
 

@@ -8,6 +8,7 @@ import json
 import math
 import multiprocessing
 import os
+import signal
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -20,6 +21,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
+from ctid_cli.progress import doing
 from ctid_cli.signals.data_checks import Rows
 from ctid_cli.signals.files import require_file, require_values
 from ctid_cli.signals.hdf5 import hdf5_arrays, text_of
@@ -40,7 +42,8 @@ def read_array_table(path: str | os.PathLike[str]) -> Table:
 @lru_cache(maxsize=2)  # a command first looks at the names of a file
 def _read_table(file: str, version: tuple[int, ...]) -> Table:
     """Read one version of a file."""
-    content, vectors = _read_in_own_process(file)
+    with doing(f"reading {Path(file).name}"):
+        content, vectors = _read_in_own_process(file)
     if "refused" in content:
         raise DataError(f"{file}: {content['refused']}")
     names, wrong = content["names"], content["wrong"]
@@ -68,10 +71,12 @@ def _read_in_own_process(file: str) -> tuple[dict[str, Any], dict[str, Array]]:
             warnings.simplefilter("ignore", DeprecationWarning)
             process = multiprocessing.get_context("fork").Process(target=_write_content, args=(file, folder))
             process.start()
-        process.join(LEAST_PATIENCE + os.stat(file).st_size / SLOWEST)
-        if process.is_alive():
-            process.kill()
-            process.join()
+        try:
+            process.join(LEAST_PATIENCE + os.stat(file).st_size / SLOWEST)
+        finally:
+            if process.is_alive():
+                process.kill()
+                process.join()
         if process.exitcode != 0:
             kind = "a MATLAB file" if Path(file).suffix.lower() in MATLAB else "an HDF5 file"
             raise DataError(f"{file}: this is not {kind}, or a damaged one; {_how_to_save(file)}")
@@ -83,6 +88,7 @@ def _read_in_own_process(file: str) -> tuple[dict[str, Any], dict[str, Array]]:
 def _write_content(file: str, folder: Path) -> None:
     """Write the vectors of a file to a folder, and the reasons why other variables are not vectors."""
     faulthandler.disable()  # a crash is expected here
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process ends this one
     try:
         arrays, objects = _arrays(file)
         wrong = {}

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
-from functools import partial
 from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
+from ctid_cli.progress import doing, report
 from ctid_cli.signals.data_checks import Rows
 from ctid_cli.signals.files import quoted, require_file
 from ctid_cli.signals.table import Found, Table, split_header
@@ -86,7 +86,11 @@ def read_text_table(path: str | os.PathLike[str]) -> Table:
     file = require_file(path, "1: the file is empty; its first line must name the columns")
     layout = _layout(path, file)
     names, head = tuple(filter(None, layout.columns)), f"{file}:{layout.header}"
-    read = partial(_read_columns, layout)
+
+    def read(wanted: Sequence[str]) -> Found:
+        with doing(f"reading {os.path.basename(file)}"):
+            return _read_columns(layout, wanted)
+
     return Table(file, names, read, head, is_text=True, notes=layout.notes, comments=layout.comments)
 
 
@@ -242,6 +246,7 @@ def _read_columns(layout: Layout, names: Sequence[str]) -> Found:
             if frame[width].notna().any():
                 raise ValueError("a line has too many fields")
             parts.append(_numbers(layout, frame[places]).T)
+            report("", note=f"{sum(part.shape[1] for part in parts):,} lines")
     except ValueError as error:  # some field is no number, or a quotation mark is never closed
         _refuse(layout, places, str(error))
     values = np.concatenate(parts, axis=1)

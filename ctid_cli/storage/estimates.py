@@ -18,6 +18,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.errors import StorageError, UsageError
+from ctid_cli.progress import reported
 from ctid_cli.storage import columns
 from ctid_cli.storage import folder as folders
 from ctid_cli.storage import manifest as plans
@@ -46,6 +47,7 @@ def read_estimates(folder: Path, names: Sequence[str] | None = None) -> pd.DataF
     return read_stored(folder).frame(names)
 
 
+@reported("reading stored estimates")
 def read_stored(folder: Path) -> Estimates:
     """Return the estimates of the latest plan of an experiment."""
     with folders.reading_journal(folder) as log:
@@ -306,6 +308,7 @@ class Estimates:
                 key = Key(block.cell["hash"], row.pop("replicate"), block.hash, row.pop("start"))
                 yield key, row
 
+    @reported("reading stored estimates")
     def frame(self, names: Sequence[str] | None = None, types: Mapping[str, Any] | None = None) -> pd.DataFrame:
         """Return the estimates as a table, with the units of its columns; types of swept fields may be given."""
         import pandas as pd

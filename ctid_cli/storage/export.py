@@ -20,6 +20,7 @@ from pydantic_core import from_json
 
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import CtidError, DataError, StorageError
+from ctid_cli.progress import reported
 from ctid_cli.signals.files import require_file
 from ctid_cli.signals.hdf5 import require_plain_tree
 from ctid_cli.storage import column_arrays, columns
@@ -47,6 +48,7 @@ Results = Callable[[], Iterable[tuple[Slot, Mapping[str, Any]]]]
 # --- writing --------------------------------------------------------------------------------------------------------
 
 
+@reported("writing runs.h5")
 def write_runs(folder: Path, log: Journal) -> tuple[int, str]:
     """Write the estimates of the journal's plan to ``runs.h5``; return their number and the SHA-256 of the file."""
     path, noted = folder / EXPORT, log.exported()

@@ -15,6 +15,7 @@ from math import inf
 from pathlib import Path
 
 from ctid_cli.errors import CtidError, RefusedError, UsageError
+from ctid_cli.progress import each
 from ctid_cli.storage import folder as folders
 from ctid_cli.storage.estimates import Estimates
 from ctid_cli.storage.export import open_export, write_runs
@@ -90,7 +91,7 @@ def merge(sources: Iterable[Path], target: Path, *, allow_mixed: bool = False, p
         with closing(log):
             taken = _Taken(target, log, plan, keys, allow_mixed=allow_mixed)
             with log.transaction():
-                for folder in others:
+                for folder in each("folder", others):
                     with _reading(folder) as other:
                         other.check()
                         log.add_rows(taken.new_rows(folder, other))

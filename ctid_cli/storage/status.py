@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ctid_cli.errors import CtidError, DamageError, UsageError
+from ctid_cli.progress import reported
 from ctid_cli.storage import columns
 from ctid_cli.storage import folder as folders
 from ctid_cli.storage.estimates import Estimates, read_stored, stored_in
@@ -204,6 +205,7 @@ class Verification:
         return not any(finding.state in WRONG for finding in self.findings)
 
 
+@reported("checking stored estimates")
 def verify(folder: Path) -> Verification:
     """Read and check everything stored by a run."""
     live, noted, findings = False, None, []

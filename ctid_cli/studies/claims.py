@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from ctid_cli.progress import each
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.layout import picked
 from ctid_cli.reporting.study import last_part
@@ -84,7 +85,7 @@ def check_claims(found: StudyResults) -> CheckedClaims:
     study = found.study
     missing = [short for short in map(last_part, study.configs) if short not in found]
     claims = [Claim("was run", "no", "yes", False, short) for short in missing]
-    for function, calls in study.claims.items():
+    for function, calls in each("group of claims", study.claims.items()):
         state = getattr(study.module("claims"), function)
         for shorts in calls:
             if set(shorts) <= found.experiments.keys():

@@ -1,21 +1,21 @@
 """Tracking of tones over time: readings of the longest undisturbed windows, connected from row to row."""
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.progress import report
 from ctid_cli.tones import constants as c
 from ctid_cli.tones.check import Readings, explained, moving, readings_of
 from ctid_cli.tones.find import floor_bins
 from ctid_cli.tones.tone_kernels import PARAMETERS, keep_readings
 from ctid_cli.tones.window_fit import WindowTones, fit_steady, fit_tones, nearest
 
+#: Reported step.
+LENGTH = "window length"
 
-def readings_at(
-    samples: Array, places: Array, longest: int, tell: Callable[[int, int], None] | None = None
-) -> Readings:
+
+def readings_at(samples: Array, places: Array, longest: int) -> Readings:
     """Return the tones of a signal at ascending places [samples], each from its longest undisturbed window."""
     if longest == samples.size and (steady := fit_steady(samples)) is not None:
         found = readings_of(steady, longest, places)
@@ -24,11 +24,10 @@ def readings_at(
     parts: list[Readings] = []
     tones: WindowTones | None = None
     lengths = [c.SHORTEST * 2**k for k in range(64) if c.SHORTEST * 2**k < longest] + [longest]
-    for done, (length, first) in enumerate(zip(lengths, _windows(lengths, samples.size, places), strict=True)):
-        if tell is not None:
-            tell(done, len(lengths))
+    for done, (length, first) in enumerate(zip(lengths, _windows(lengths, samples.size, places), strict=True), 1):
         tones = fit_tones(samples, length, first, c.MOST_LINES, tones)
         parts.append(readings_of(tones, length, places))
+        report(LENGTH, done, len(lengths))
     # The longest windows first; at equal length, the one with the nearest middle.
     found = Readings(*(np.concatenate(each) for each in zip(*parts[::-1], strict=True)))
     found = found.at(np.argsort(found.row, kind="stable"))

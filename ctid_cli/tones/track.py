@@ -13,11 +13,12 @@ from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.processors import one_thread
+from ctid_cli.progress import calling, reported
 from ctid_cli.signals.checks import require_integer, require_positive
 from ctid_cli.tones import constants as c
 from ctid_cli.tones.check import Readings
 from ctid_cli.tones.condition import Conditioned, condition
-from ctid_cli.tones.follow import paths_of, readings_at
+from ctid_cli.tones.follow import LENGTH, paths_of, readings_at
 
 
 class Sampled(Protocol):
@@ -176,6 +177,7 @@ class Track:
 
 
 @one_thread
+@reported("following the tones")
 def track(
     record: Sampled,
     tones: int | None = None,
@@ -239,7 +241,8 @@ def track(
     longest = _longest(window, thin, ready.samples.size)
     step = max(1.0, (samples.size * interval / c.USUAL_ROWS if every is None else every) / thin)
     places = np.arange(0.0, ready.samples.size - 0.5, step)
-    found = readings_at(ready.samples, places, longest, on_progress)
+    with calling(on_progress, LENGTH):
+        found = readings_at(ready.samples, places, longest)
     paths = paths_of(found, places)
     if not paths and tones is None:
         raise DataError(

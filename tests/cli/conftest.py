@@ -11,18 +11,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from ctid_cli.cli import _compiling
 from ctid_cli.identification import choose, identify
 from ctid_cli.running import engine, job
 from ctid_cli.running.workers import Ending
 from tests.cli.json_schemas import validate_json
 from tests.cli.records import SPECIFICATIONS, first_order, rows, tones, write
-
-
-@pytest.fixture(autouse=True)
-def compiled_in_silence(monkeypatch):
-    """Suppress compilation messages, since functions may be cached or not."""
-    monkeypatch.setattr(_compiling, "SILENT", 3600.0)
 
 
 def remembered(function):
@@ -111,7 +104,6 @@ def used(tmp_path_factory, ctid):
     folder = tmp_path_factory.mktemp("used")
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
         patch.setattr(engine, "LocalWorkers", Here)
-        patch.setattr(_compiling, "SILENT", 3600.0)
         # Every estimate takes ten milliseconds, on every machine.
         ticks = itertools.count()
         patch.setattr(job, "_clocks", lambda: np.full(2, 0.01 * next(ticks)))

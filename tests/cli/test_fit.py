@@ -1,8 +1,6 @@
 """``ctid fit``: from files to a model, or to a one-sentence error."""
 
-import io
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +8,6 @@ import pytest
 from scipy.signal import lfilter
 
 from ctid_cli import Record, load_fit
-from ctid_cli.cli import _progress
 from tests.cli.records import rows, write
 
 
@@ -87,18 +84,3 @@ def test_several_files_and_a_validation_record(ctid, record, tmp_path):
     assert [item["file"] for item in content["records"]] == [str(record), str(second)]
     assert content["validation"]["file"] == str(third)
     assert content["validation"]["r2"] > 0.99
-
-
-def test_a_fit_is_announced_on_a_terminal(monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    shown = {}
-    for kind in (Terminal, io.StringIO):
-        monkeypatch.setattr(sys, "stderr", kind())
-        with _progress.FitProgress(1_000_000) as progress:
-            progress(1, 2)
-        shown[kind] = sys.stderr.getvalue()
-    assert "fitting 1000000 samples" in shown[Terminal].replace(",", "")
-    assert "fitting" not in shown[io.StringIO]

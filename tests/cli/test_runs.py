@@ -75,7 +75,7 @@ def test_an_experiment_that_fails_wholly_does_not_stop_the_next_one(ctid, here, 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_stopped_run_can_be_resumed(ctid, here, number, code):
     process = start(here, "run tiny.yaml --runs 5000 --jobs 1")
-    assert "30000 estimates of 10000 data sets to compute" in process.stderr.readline()
+    assert any("30000 estimates of 10000 data sets to compute" in line for line in process.stderr)
     time.sleep(1.0)
     process.send_signal(number)
     begun = time.monotonic()

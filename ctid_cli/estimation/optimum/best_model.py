@@ -20,6 +20,7 @@ from ctid_cli.inference.sensitivities import SumStructure
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.progress import reported
 
 #: A model found from a part of the records is accepted for all of them if its mean squared error on all is at most
 #: AS_GOOD times that on the part, and it explains at least the share EXPLAINED of the output's variance.
@@ -118,6 +119,7 @@ def _point(start: Begin, box: Box) -> Point:
     return point_of(np.asarray(poles, dtype=complex), delays, box)
 
 
+@reported("")
 def best_output_error(
     problem: Problem,
     poles: int,
@@ -221,12 +223,14 @@ def _from_part(search: StructureSearch, pilot: StructureSearch, poles: int, fewe
     return replace(whole, tried=expected.tried, agree=expected.agree)
 
 
+@reported("")
 def best_of_orders(search: StructureSearch, poles: int, zeros: int) -> Optimum:
     """Return the least squared error of one structure of a common search, and of those in its closure."""
     search.climb(poles, zeros)
     return _least(search, poles, zeros, True)
 
 
+@reported("")
 def best_sum(
     problem: Problem,
     delays: Bounds,
@@ -270,6 +274,7 @@ def best_sum(
     return _least(search, order, zeros, False)
 
 
+@reported("")
 def best_near(search: StructureSearch, zeros: int, point: Point) -> Optimum:
     """Return the least squared error in the basin of given poles, without integrators, and delays."""
     search.refine(point.poles.size, zeros, [point])

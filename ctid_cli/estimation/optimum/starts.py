@@ -15,6 +15,7 @@ from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem, responses
 from ctid_cli.estimation.optimum.search import Descent, Local
 from ctid_cli.models.additive import Term
+from ctid_cli.progress import report
 
 #: Largest product of evaluations and samples for pairs of the least damping: all resolved frequencies up to 1,000
 #: samples. Number of the best pairs, and of delays, that are compared together.
@@ -110,6 +111,7 @@ class StructureSearch:
             for m in range(min(zeros, n + self.most_zeros) + 1):
                 if (n, m) in self._minima:
                     continue
+                report("", note=f"{n} of {poles} poles, {m} of {zeros} zeros")
                 if self.pilot is not None:
                     points = self._from_pilot(self.pilot, n, m)
                 else:
@@ -146,6 +148,7 @@ class StructureSearch:
         ends = self._ends.setdefault((poles, zeros), [])
         queue, cells = list(points), set[tuple[int, int]]()
         while queue:
+            report("start", len(ends) + 1, len(ends) + len(queue))
             local = descent.descend(queue.pop(0), kept)
             ends.append(local.squared_error)
             kept.append(local)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
+from ctid_cli.progress import reported
 from ctid_cli.text import did_you_mean
 
 if TYPE_CHECKING:
@@ -84,6 +85,7 @@ class Drawing(NamedTuple):
             self.draw(figure)
         return figure
 
+    @reported("drawing the figure")
     def saved(self, style: Format = "svg") -> bytes:
         """Draw the figure as a file; the same drawing always gives the same bytes."""
         file, figure = io.BytesIO(), self.figure()
@@ -91,6 +93,7 @@ class Drawing(NamedTuple):
             figure.savefig(file, format=style, metadata=_METADATA[style], dpi=200)
         return file.getvalue()
 
+    @reported("drawing the figure")
     def laid_out_once(self) -> bytes:
         """Draw as SVG in half the time: the layout is computed once, and may differ slightly from ``saved``."""
         file, figure = io.BytesIO(), self.figure()

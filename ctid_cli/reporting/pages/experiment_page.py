@@ -9,6 +9,7 @@ import pandas as pd
 
 import ctid_cli
 from ctid_cli.errors import UsageError
+from ctid_cli.progress import reported
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.figures.experiment_plot import experiment_drawing, kinds_of, main_measure
 from ctid_cli.reporting.measures import SUCCESSES, default_measures
@@ -31,6 +32,7 @@ ALL_PAIRS = 3
 FAILURES_LISTED = 20
 
 
+@reported("writing the page")
 def experiment_page(results: Results, out: Path) -> str:
     """Return the page as HTML."""
     sessions = public_sessions(results.folder)
