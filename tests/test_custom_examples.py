@@ -27,6 +27,7 @@ def out(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_study(out):
     rows = json.loads(ctid("export", "custom-study", "--format", "json", "--out", out).stdout)
     assert len(rows) == 12
@@ -43,12 +44,14 @@ def test_the_study(out):
     assert re.search(r"mine +\d+\.\d \[.*\] +\d", ctid("table", "custom-study", "--out", out).stdout)
 
 
+@pytest.mark.slow
 def test_the_tank_is_nearly_linear(out):
     rows = json.loads(ctid("export", "tank", "--format", "json", "--out", out).stdout)
     found = np.array([[row["numerator"][0], row["denominator"][1]] for row in rows])
     np.testing.assert_allclose(found, [[0.5, 0.25]] * 4, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_an_estimator_of_frequencies(tmp_path):
     ctid("run", EXAMPLES / "zero_crossings.yaml", "--allow-code", "--quiet", "--jobs", "1", "--out", tmp_path)
     rows = json.loads(ctid("export", "zero-crossings", "--format", "json", "--out", tmp_path).stdout)

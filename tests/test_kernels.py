@@ -172,7 +172,11 @@ def replaced(file, old, new, *, same_stamp=False):
 
 @pytest.mark.parametrize(
     ("place", "changes"),
-    [("edited in place", [CALLEE]), ("upgraded by an installer", [CONSTANT]), ("read-only", [CALLEE, CONSTANT])],
+    [
+        ("edited in place", [CALLEE]),
+        ("upgraded by an installer", [CONSTANT]),
+        pytest.param("read-only", [CALLEE, CONSTANT], marks=pytest.mark.slow),
+    ],
 )
 def test_changes_of_callees_and_constants_are_computed_with(place, changes, tmp_path):
     """After any change of a source, the next process uses it, without deleting caches."""

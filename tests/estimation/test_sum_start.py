@@ -44,6 +44,7 @@ def test_two_modes_in_closed_loop(seed):
     assert_in_basin(loop_record(TWO_MODES, 500, 0.1, seed), TWO_MODES, instruments="closed_loop")
 
 
+@pytest.mark.slow
 def test_beam_that_still_rings():
     record, system, _ = beam_record(1, periods=3)
     assert_in_basin(record, system, initial_state="estimated")

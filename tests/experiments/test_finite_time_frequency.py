@@ -56,6 +56,7 @@ def study(out):
 one = claims.one
 
 
+@pytest.mark.slow
 def test_settling_times_are_those_of_a_direct_simulation(study):
     rows = measured.settling(study["two-tones"])
     t = 0.01 * np.arange(6000)

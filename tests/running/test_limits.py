@@ -46,6 +46,7 @@ def test_what_takes_too_long_is_ended_and_all_else_is_stored(tmp_path: Path, mon
     assert (summary.planned, summary.computed, summary.failed, summary.exit_code) == (15, 15, 1, 0)
 
 
+@pytest.mark.slow
 def test_processor_time_and_memory_are_limited_too(tmp_path: Path) -> None:
     hostile = [Toy("hang in preparation", at=1, order=5), Toy(order=6), Toy("grow", at=2, order=8)]
     run(toys(*hostile, limits={"cpu_seconds": 1.5, "memory_mb": 300}), tmp_path)
