@@ -13,6 +13,7 @@ from ctid_cli import (
     UsefulRedundancy,
     track,
 )
+from ctid_cli.custom_code import STUDIES, find_class
 from ctid_cli.estimation.compilation import compile_kernels
 from ctid_cli.frequency.drem import DremFiniteTime, DremGradient, DremWindow
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
@@ -26,7 +27,12 @@ ESTIMATORS = (
     DelayProfile(2, 0, (0.0, 1.0), noise_model="arma:1,1"),
 )
 IN_LOOP = (Srivc(2, 1, 0.0, instruments="closed_loop"), LoopOutputError(2, 0, (0.0, 0.5)))
+COMPARATORS = STUDIES / "finite_time_frequency" / "comparators"
+Observer = find_class("./adaptive_observer.py:AdaptiveObserver", COMPARATORS)
+FilterRegression = find_class("./filter_regression.py:FilterRegression", COMPARATORS)
 FREQUENCY = (
+    Observer(tones=2, initial_frequencies=(2.0, 5.0)),
+    FilterRegression(tones=2, pole=3.0, algorithm="gradient"),
     DremGradient(tones=2, h=0.03, d=0.05),
     DremFiniteTime(tones=2, h=0.03, d=0.05),
     DremWindow(tones=2, h=0.03, d=0.05, memory=1.0),
