@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from ctid_cli import Record, load_fit
+from ctid_cli import DataError, Record, load_fit
 from tests.cli.records import rows, write
 
 
@@ -84,3 +84,14 @@ def test_several_files_and_a_validation_record(ctid, record, tmp_path):
     assert [item["file"] for item in content["records"]] == [str(record), str(second)]
     assert content["validation"]["file"] == str(third)
     assert content["validation"]["r2"] > 0.99
+
+
+@pytest.mark.parametrize(("options", "noted"), [("--poles 9 --zeros 8", True), ("--poles 6 --zeros 4", False)])
+def test_many_coefficients_of_few_samples_are_noted_before_the_search(ctid, record, monkeypatch, options, noted):
+    def identify(*arguments, **options):
+        raise DataError("the search begins")
+
+    monkeypatch.setattr("ctid_cli.identification.identify.identify", identify)
+    first, *others = ctid(f"fit {options} --delay 0", record, code=2).stderr.splitlines()
+    assert ("18 coefficients are asked for, and 500 samples seldom determine so many" in first) == noted
+    assert [first, *others][-1] == "ctid: the search begins"
