@@ -94,7 +94,7 @@ def _note_many_coefficients(poles: object, zeros: object, samples: int) -> None:
     """Say at once that many coefficients are asked for of few samples."""
     count = poles + (zeros if isinstance(zeros, int) else 0) + 1 if isinstance(poles, int) else 0
     if count >= MANY and samples < SAMPLES_EACH * count:
-        few = f"{count} coefficients are asked for, and {samples} samples seldom determine so many"
+        few = f"{count} coefficients are asked for, and {samples} samples seldom determine them"
         typer.echo(f"ctid fit: {few}; the search takes long (ctid order compares smaller structures)", err=True)
 
 

@@ -93,5 +93,5 @@ def test_many_coefficients_of_few_samples_are_noted_before_the_search(ctid, reco
 
     monkeypatch.setattr("ctid_cli.identification.identify.identify", identify)
     first, *others = ctid(f"fit {options} --delay 0", record, code=2).stderr.splitlines()
-    assert ("18 coefficients are asked for, and 500 samples seldom determine so many" in first) == noted
+    assert ("18 coefficients are asked for, and 500 samples seldom determine them" in first) == noted
     assert [first, *others][-1] == "ctid: the search begins"
