@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from functools import cache
-from threading import Thread
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -56,18 +54,6 @@ LOOKS: tuple[dict[str, Any], ...] = (
 Format = Literal["svg", "png", "pdf"]
 #: Metadata of each format that are left out: date and versions.
 _METADATA: dict[Format, Any] = {"svg": {"Date": None}, "png": {"Software": None}, "pdf": {"CreationDate": None}}
-
-
-def load_matplotlib() -> None:
-    """Start to import Matplotlib, while compiled kernels continue."""
-    Thread(target=_import_matplotlib).start()
-
-
-def _import_matplotlib() -> None:
-    # The caller reports a failed import.
-    with suppress(ImportError):
-        import matplotlib.backends.backend_svg
-        import matplotlib.figure  # noqa: F401
 
 
 class Drawing(NamedTuple):
