@@ -70,7 +70,7 @@ def _table(table: Table) -> Markup:
 
 
 def _drawn(drawing: Drawing | bytes, name: str) -> Markup:
-    return inline(drawing if isinstance(drawing, bytes) else drawing.laid_out_once(), name)
+    return inline(drawing if isinstance(drawing, bytes) else drawing.saved(), name)
 
 
 def inline(svg: bytes, name: str) -> Markup:
