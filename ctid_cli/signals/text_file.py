@@ -45,11 +45,8 @@ NUMBERS = {
     sign: re.compile(rf"[+-]?(\d+{mark}?\d*|{mark}\d+)(e[+-]?\d+)?|[+-]?inf(inity)?|true|false", re.IGNORECASE)
     for sign, mark in ((".", r"\."), (",", ","))
 }
-#: A number of at most 15 digits with an exponent of at most 8. Its digits as an integer and the power of ten, at most
-#: 1e22, are exact, so that pandas, which multiplies or divides them, rounds the number like ``float``.
-SHORT = re.compile(
-    r"[+-]?(?=[0-9.]{1,16}(?![0-9.]))(?:[0-9]{1,15}(?:\.[0-9]{0,14})?|\.[0-9]{1,15})(?:[eE][+-]?0?[0-8])?"
-)
+#: A number that is not missing, not infinite, and no truth value.
+PLAIN = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,2})?")
 NO_DATA = "the file has a header and no data"
 TEXT = "this is not a text file in UTF-8, or in UTF-16 with a byte order mark"
 FORMATS = "records are read from text (.csv, .txt), MATLAB files (.mat) and HDF5 files (.h5)"
@@ -241,7 +238,7 @@ def _all_numbers(fields: Sequence[str]) -> bool:
 def _read_columns(layout: Layout, names: Sequence[str]) -> Found:
     """Read some columns; lines with only empty fields are left out."""
     places, width = [layout.columns.index(name) for name in names], len(layout.columns)
-    plain = _short_numbers(layout, places)
+    plain = _plain_numbers(layout, places)
     parts: list[Any] = [] if plain is None else [plain]
     try:
         for frame in _chunks(layout, places) if plain is None else ():
@@ -273,22 +270,21 @@ def _read_columns(layout: Layout, names: Sequence[str]) -> Found:
     return Found(dict(zip(names, values, strict=True)), Rows(os.fspath(layout.path), lines), tuple(notes))
 
 
-def _short_numbers(layout: Layout, places: Sequence[int]) -> Array | None:
-    """Return columns of a small file, shape (columns, rows); None if not every field is a short number.
+def _plain_numbers(layout: Layout, places: Sequence[int]) -> Array | None:
+    """Return columns of a small file of plain numbers only, shape (columns, rows); None for any other file.
 
-    pandas would read the same numbers, but takes longer to import.
+    pandas would read the same numbers, the nearest ones, but its import takes a third of a second.
     """
     with layout.opened() as file:
         text = file.read(HEAD_BYTES + 1)
     lines = text.replace("\r\n", "\n").removesuffix("\n")
-    if len(text) > HEAD_BYTES or '"' in lines or "\r" in lines or not layout.origins.keys().isdisjoint(places):
+    if len(text) > HEAD_BYTES or layout.decimal != "." or not {'"', "\r"}.isdisjoint(lines):
         return None
     rows = [line.split(None if layout.separator == " " else layout.separator) for line in lines.split("\n")]
-    width = len(layout.columns)
-    if any(len(row) != width for row in rows):
+    if any(len(row) != len(layout.columns) for row in rows):
         return None
     columns = [[row[place] for row in rows] for place in places]
-    if layout.decimal != "." or not all(map(SHORT.fullmatch, chain.from_iterable(columns))):
+    if not all(map(PLAIN.fullmatch, chain.from_iterable(columns))):
         return None
     return np.array([list(map(float, column)) for column in columns])
 
