@@ -277,11 +277,11 @@ def _plain_numbers(layout: Layout, places: Sequence[int]) -> Array | None:
     """
     with layout.opened() as file:
         text = file.read(HEAD_BYTES + 1)
-    lines = text.replace("\r\n", "\n").removesuffix("\n")
-    if len(text) > HEAD_BYTES or layout.decimal != "." or not {'"', "\r"}.isdisjoint(lines):
+    if len(text) > HEAD_BYTES or layout.decimal != "." or '"' in text:
         return None
+    lines = text.replace("\r\n", "\n").removesuffix("\n")
     rows = [line.split(None if layout.separator == " " else layout.separator) for line in lines.split("\n")]
-    if any(len(row) != len(layout.columns) for row in rows):
+    if "\r" in lines or any(len(row) != len(layout.columns) for row in rows):
         return None
     columns = [[row[place] for row in rows] for place in places]
     if not all(map(PLAIN.fullmatch, chain.from_iterable(columns))):
