@@ -203,7 +203,7 @@ class Result(ABC):
         return tables[0] if tables else Table.of_rows([self.content()])
 
     def to_frame(self) -> pd.DataFrame:
-        """Return the main table of the result."""
+        """Return the main table of the result as a DataFrame."""
         return self.main_table().to_frame()
 
     def plot(self) -> Figure:
