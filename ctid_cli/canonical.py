@@ -1,10 +1,10 @@
-"""Canonical JSON of plain data, and its hash as identity."""
+"""Canonical JSON of plain data, its hash as identity, and strict parsing."""
 
 import hashlib
 import json
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 
 def canonical_json(content: Any) -> str:
@@ -28,3 +28,12 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def read_json(text: str) -> Any:
+    """Parse JSON; refuse numbers that are not valid JSON."""
+
+    def refuse(constant: str) -> NoReturn:
+        raise ValueError(f"{constant} is no JSON number")
+
+    return json.loads(text, parse_constant=refuse)

@@ -119,9 +119,25 @@ def span(text: str, number: Callable[[str], Number]) -> tuple[Number, Number] | 
 
 
 @reported("writing the result")
-def emit(result: Result, form: Format, written: Sequence[Path] = (), stored: str | None = None) -> None:
-    """Print a result in the requested form, JSON as it was stored, and name the written files."""
+def emit(
+    result: Result,
+    form: Format,
+    written: Sequence[Path] = (),
+    stored: str | None = None,
+    draw: Callable[[], None] = lambda: None,
+) -> None:
+    """Print a result in the requested form, JSON as it was stored; then draw its figures, and name the files."""
     names = list(map(str, written))
+    try:
+        _print(result, form, names, stored)
+    finally:
+        # A reader that closes the pipe, such as head, does not lose the figures.
+        draw()
+    if names and form == "text":
+        typer.echo(f"\nWritten: {', '.join(names)}")
+
+
+def _print(result: Result, form: Format, names: Sequence[str], stored: str | None) -> None:
     if form == "json":
         if stored is None:
             content = result.json_content()
@@ -131,8 +147,6 @@ def emit(result: Result, form: Format, written: Sequence[Path] = (), stored: str
     # Text is wrapped to a terminal, but is the same everywhere in a pipe or a file.
     columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
     typer.echo(result.write(form, columns))
-    if names and form == "text":
-        typer.echo(f"\nWritten: {', '.join(names)}")
 
 
 def refuse_overwriting(inputs: Iterable[Path], written: Sequence[Path]) -> None:

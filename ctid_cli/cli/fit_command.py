@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,20 +34,25 @@ class WritingOptions:
     out: Annotated[Path, flag("--out", "Folder for fit.json and fit.svg.", "DIR")] = Path(".")
 
     @reported("preparing the files")
-    def contents(self, result: FitResult, command: str) -> dict[Path, bytes]:
-        """Return the contents of the files by path; the first is the fit itself."""
-        from ctid_cli.reporting.column_file import frame_bytes
-        from ctid_cli.reporting.fit_tables import fit_tables, model_code
-
+    def contents(self, result: FitResult, command: str) -> dict[Path, Callable[[], bytes]]:
+        """Return functions that make the contents of the files by path; the first is the fit itself."""
         text = result.file_text(self.out, command)
-        contents = {self.out / "fit.json": text.encode() + b"\n", self.out / "fit.svg": result.drawing().saved()}
+        contents: dict[Path, Callable[[], bytes]] = {
+            self.out / "fit.json": lambda: text.encode() + b"\n",
+            self.out / "fit.svg": lambda: result.drawing().saved(),
+        }
         if self.report:
-            contents[self.out / "fit.html"] = result.page(json.loads(text)).encode()
+            contents[self.out / "fit.html"] = lambda: result.page(json.loads(text)).encode()
         if self.csv is not None:
-            contents |= {self.csv / name: frame_bytes(frame) for name, frame in fit_tables(result).items()}
+            from ctid_cli.reporting.column_file import csv_bytes
+            from ctid_cli.reporting.fit_tables import fit_tables
+
+            contents |= {self.csv / name: partial(csv_bytes, table) for name, table in fit_tables(result).items()}
         if self.export is not None:
+            from ctid_cli.reporting.fit_tables import model_code
+
             name, code = model_code(result.fitted, self.export, result.units.time)
-            contents[self.out / name] = code.encode()
+            contents[self.out / name] = code.encode
         return contents
 
 
@@ -124,8 +130,15 @@ def fit(
         result = _fit_of_records(files, request, columns, assessment)
     contents = writing.contents(result, given_command(context))
     refuse_overwriting(read, [*contents])
-    write_files(contents)
-    emit(result, form.form, list(contents), stored=next(iter(contents.values())).decode())
+    (path, fit_itself), *others = contents.items()
+    stored = fit_itself()
+    write_files({path: stored})
+
+    def write_others() -> None:
+        for path, content in others:
+            write_files({path: content()})
+
+    emit(result, form.form, list(contents), stored.decode(), write_others)
 
 
 def _fit_of_records(

@@ -53,9 +53,11 @@ class LoopOptions:
     @cached_property
     def known(self) -> Any:
         """Loop of the file; None if there is none."""
+        if self.loop is None or self.loop == UNKNOWN:
+            return None
         from ctid_cli.specification.load import load_loop
 
-        return None if self.loop in (None, UNKNOWN) else load_loop(Path(self.loop or ""))
+        return load_loop(Path(self.loop))
 
     def check(self) -> None:
         """Refuse incomplete loop options, and a file that contains no loop."""

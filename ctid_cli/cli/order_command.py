@@ -77,8 +77,8 @@ def order(
         result = OrderSearchResult.of(choice, given, records)
     written = [out / "order.json", out / "order.svg"]
     content = json.dumps(plain({**result.json_content(), "written": list(map(str, written))}), allow_nan=False)
-    write_files({written[0]: content.encode() + b"\n", written[1]: result.drawing().saved()})
-    emit(result, form.form, written)
+    write_files({written[0]: content.encode() + b"\n"})
+    emit(result, form.form, written, draw=lambda: write_files({written[1]: result.drawing().saved()}))
 
 
 def _range(name: str, text: str | None, least: int, most: int = 12) -> tuple[int, int] | None:

@@ -81,7 +81,7 @@ def compare(
     Prints their fits and tests of their residuals, and writes comparison.csv and comparison.svg.
     """
     from ctid_cli.estimators import model_comparison
-    from ctid_cli.reporting.column_file import frame_bytes
+    from ctid_cli.reporting.column_file import csv_bytes
     from ctid_cli.reporting.compare_result import ModelComparison, short_names
     from ctid_cli.storage.fit_file import read_fits
 
@@ -93,8 +93,8 @@ def compare(
     models = [each.result for each in fits]
     found = model_comparison.compare(models, measurement.record, initial_state=initial_state, offset=offset)
     result = ModelComparison(fits, measurement, found)
-    write_files({written[0]: frame_bytes(result.to_frame()), written[1]: result.drawing().saved()})
-    emit(result, form.form, written)
+    write_files({written[0]: csv_bytes(result.main_table())})
+    emit(result, form.form, written, draw=lambda: write_files({written[1]: result.drawing().saved()}))
 
 
 def _record(fit: StoredFit, file: Path, columns: RecordOptions, hold: Hold | None) -> Measurement:
@@ -152,7 +152,7 @@ def frf(
     local polynomials. Writes frf.csv and frf.svg.
     """
     from ctid_cli.inference.frequency_response import estimate_frequency_response
-    from ctid_cli.reporting.column_file import frame_bytes
+    from ctid_cli.reporting.column_file import csv_bytes
     from ctid_cli.reporting.frf_result import FrequencyResponseResult
 
     written = [out / "frf.csv", out / "frf.svg"]
@@ -161,5 +161,5 @@ def frf(
     records = columns.read_all(files, None, hold)
     found = estimate_frequency_response(records.data, time_unit=records.units.time, **arguments)
     result = FrequencyResponseResult(found, records)
-    write_files({written[0]: frame_bytes(result.to_frame()), written[1]: result.drawing().saved()})
-    emit(result, form.form, written)
+    write_files({written[0]: csv_bytes(result.main_table())})
+    emit(result, form.form, written, draw=lambda: write_files({written[1]: result.drawing().saved()}))

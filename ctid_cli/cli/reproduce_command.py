@@ -105,9 +105,7 @@ def _require_whole(studies: Sequence[Study]) -> None:
 
 def _list(studies: Sequence[Study], form: FormatOptions) -> None:
     """Print the subject of each study, and the experiments of all."""
-    import pandas as pd
-
-    from ctid_cli.reporting.document import Section
+    from ctid_cli.reporting.document import Section, Table
     from ctid_cli.reporting.table_result import TableResult
 
     rows = [
@@ -116,7 +114,7 @@ def _list(studies: Sequence[Study], form: FormatOptions) -> None:
         for experiment, config in study.configs.items()
     ]
     titles = [f"- {study.name}: {study.title}" for study in studies]
-    table = pd.DataFrame(rows).drop(columns="study")
+    table = Table.of_rows([{key: row[key] for key in ("experiment", "specification")} for row in rows])
     emit(TableResult(rows, [Section("", titles, table, notes=["Specifications are in configs."])]), form.form)
 
 

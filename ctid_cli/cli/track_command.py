@@ -90,20 +90,17 @@ def track(
     refuse_overwriting([file], written)
     record = reading.read(file)
     _require_part(record, reading)
-    from ctid_cli.reporting.figures.style import load_matplotlib
-
-    load_matplotlib()
     found = options.follow(record)
     from ctid_cli.canonical import plain
-    from ctid_cli.reporting.column_file import frame_bytes, hdf5_bytes
+    from ctid_cli.reporting.column_file import csv_bytes, hdf5_bytes
     from ctid_cli.reporting.track_result import TrackResult
     from ctid_cli.storage.track_file import track_file_text
 
     result = TrackResult(found, record, options.accuracy)
     text = track_file_text(found, plain(result.content()), file, reading, out, given_command(context))
-    table = (hdf5_bytes if hdf5 else frame_bytes)(result.to_frame())
-    write_files(dict(zip(written, (table, result.drawing().saved(), text.encode() + b"\n"), strict=True)))
-    emit(result, form.form, written)
+    table = (hdf5_bytes if hdf5 else csv_bytes)(result.main_table())
+    write_files({written[0]: table, written[2]: text.encode() + b"\n"})
+    emit(result, form.form, written, draw=lambda: write_files({written[1]: result.drawing().saved()}))
 
 
 def _require_part(record: SampledSignal, reading: Reading) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
 
 from ctid_cli.inference.monte_carlo_tests import FEWEST
-from ctid_cli.reporting.document import Column, Result, Section, aligned_lines
+from ctid_cli.reporting.document import Column, Result, Section, Table, aligned_lines
 from ctid_cli.reporting.layout import setting_text, setting_title
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.surprises import surprises
@@ -88,14 +88,14 @@ class AccuracyResult(Result):
             return Section("", [agree])
         return Section("Unexpected in the stored estimates:", [f"- {text}" for text in self.surprises])
 
-    def to_frame(self) -> pd.DataFrame:
+    def main_table(self) -> Table:
         """Return one row for each parameter of each estimator, setting and number of samples."""
         rows = [
             {**e["settings"], "samples": e["samples"], "estimator": e["estimator"], **e["options"], **parameter}
             for e in self.estimates
             for parameter in e["parameters"]
         ]
-        return pd.DataFrame(rows)
+        return Table.of_rows(rows)
 
     def content(self) -> dict[str, Any]:
         """Return all numbers for JSON."""
@@ -110,12 +110,12 @@ def _tables(estimates: Sequence[Mapping[str, Any]]) -> Iterator[Section]:
         rows = [{"samples": each["samples"], **parameter} for parameter in each["parameters"]]
         if rows:
             tables.setdefault((_words(each["settings"]), _title(each)), []).extend(rows)
-    same: dict[tuple[str, str], tuple[Section, list[str]]] = {}
+    same: dict[tuple[str, str], tuple[Table, list[str]]] = {}
     for (where, title), rows in tables.items():
-        table = Section.table(rows, COLUMNS)
+        table = Table.of(rows, COLUMNS)
         same.setdefault((where, repr(aligned_lines(table))), (table, []))[1].append(title)
     for (where, _), (table, titles) in same.items():
-        yield replace(table, title=f"{listed(titles)}: standard errors{where and f' at {where}'}")
+        yield Section(f"{listed(titles)}: standard errors{where and f' at {where}'}", table=table)
 
 
 def _formula(formula: str, entries: pd.DataFrame) -> str:

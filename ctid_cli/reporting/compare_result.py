@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from ctid_cli.errors import UsageError
 from ctid_cli.estimators.model_comparison import ModelOnRecord
 from ctid_cli.inference.units import Units
-from ctid_cli.reporting.document import Column, Result, Section
+from ctid_cli.reporting.document import Column, Result, Section, Table
 from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, name_axes, outline, plain
 from ctid_cli.reporting.fit_plot import curve
 from ctid_cli.reporting.layout import picked
@@ -85,7 +84,7 @@ class ModelComparison(Result):
         best_first = sorted(rows, key=lambda row: -row["fit_percent"])
         return [
             Section(sentences=[f"{samples}{one.t[-1]:.6g} {unit.time}."]),
-            Section.table(best_first, columns, notes=[MEANING], drawing=self.drawing()),
+            Section(table=Table.of(best_first, columns), notes=[MEANING], drawing=self.drawing()),
         ]
 
     def _rows(self) -> list[dict[str, Any]]:
@@ -102,13 +101,13 @@ class ModelComparison(Result):
             for name, fit, one in zip(self.names, self.fits, self.found, strict=True)
         ]
 
-    def to_frame(self) -> pd.DataFrame:
+    def main_table(self) -> Table:
         """Return the measured output, and that of each model, at common samples."""
         units, first = self.units, self.found[0]
         columns = {f"t [{units.time}]": first.t, units.label("measured", units.output): first.measured}
         for name, one in zip(self.names, self.found, strict=True):
             columns[units.label(f"simulated {name}", units.output)] = one.simulated
-        return pd.DataFrame(columns)
+        return Table.of_columns(columns)
 
     def content(self) -> dict[str, Any]:
         """Return the comparison for JSON."""

@@ -13,7 +13,7 @@ import pandas as pd
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.paired import fisher, holm
 from ctid_cli.progress import reported
-from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.document import Result, Section, Table
 from ctid_cli.reporting.layout import number, percent
 from ctid_cli.reporting.measures import records_of, settings_of
 from ctid_cli.reporting.results import shown_path
@@ -74,13 +74,17 @@ class ComparisonResult(Result):
             "notes": list(self.notes),
         }
 
+    def main_table(self) -> Table:
+        """Return one row for each comparison."""
+        return Table.of_frame(self.cells)
+
     def to_frame(self) -> pd.DataFrame:
         """Return one row for each comparison."""
         return self.cells
 
     def sections(self) -> list[Section]:
         """Return a summary, and the cells that differ."""
-        listed = [Section(frame=_listing(self.mismatches))] if len(self.mismatches) else []
+        listed = [Section(table=Table.of_frame(_listing(self.mismatches)))] if len(self.mismatches) else []
         notes = [Section(notes=[f"Note: {note}" for note in self.notes])] if self.notes else []
         return [Section(sentences=[self._summary()]), *listed, *notes]
 

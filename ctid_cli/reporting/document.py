@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import html
+import io
 import itertools
 import json
 import math
@@ -53,14 +55,115 @@ class Column(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
+class Table:
+    """Titles and columns of a table; pandas is imported only for ``to_frame``.
+
+    A column is a sequence of plain values, None where there is none, or an array.
+    """
+
+    titles: Sequence[str]
+    columns: Sequence[Any]
+    #: Format of the numbers of a column by its title, such as ``.2f``; ``.6g`` by default.
+    formats: Mapping[str, str] = field(default_factory=dict)
+    #: Whether the first column identifies the rows: it is the index of the DataFrame.
+    is_named: bool = False
+    #: Units of the columns by title, if they are known: ``attrs["units"]`` of the DataFrame.
+    units: Mapping[str, str | None] | None = None
+
+    @classmethod
+    def of(cls, rows: Iterable[object], columns: Sequence[Column]) -> Table:
+        """Return a table of objects or mappings; columns without any value are left out."""
+        found = [picked(row, [column.key for column in columns]) for row in rows]
+        values = {column: _plain_column([row[column.key] for row in found]) for column in columns}
+        shown = [column for column, own in values.items() if not all(map(_is_missing, own))]
+        formats = {column.header: column.form for column in shown}
+        return cls([column.header for column in shown], [values[column] for column in shown], formats)
+
+    @classmethod
+    def of_rows(cls, rows: Sequence[Mapping[str, Any]], *, is_named: bool = False) -> Table:
+        """Return a table with a column for each key that any of the rows has."""
+        titles = list(dict.fromkeys(key for row in rows for key in row))
+        return cls(titles, [_plain_column([row.get(title) for row in rows]) for title in titles], is_named=is_named)
+
+    @classmethod
+    def of_columns(cls, columns: Mapping[str, Any], **about: Any) -> Table:
+        """Return a table of columns by title."""
+        return cls(list(columns), list(columns.values()), **about)
+
+    @classmethod
+    def of_frame(cls, frame: pd.DataFrame, formats: Mapping[str, str] | None = None) -> Table:
+        """Return a table with the columns of a DataFrame, whose index is the first of them if it has a name."""
+        is_named = frame.index.name is not None
+        shown = frame.reset_index() if is_named else frame
+        columns = [values.astype(object).where(values.notna(), None).tolist() for _, values in shown.items()]
+        return cls(list(map(str, shown)), columns, formats or {}, is_named)
+
+    @classmethod
+    def of_lines(cls, titles: Sequence[str], lines: Iterable[Sequence[Any]], **about: Any) -> Table:
+        """Return a table of lines with a value for each title."""
+        found = list(lines)
+        return cls(titles, [[line[k] for line in found] for k in range(len(titles))], **about)
+
+    @classmethod
+    def of_pairs(cls, lines: Iterable[Sequence[str]]) -> Table:
+        """Return labels and texts as a table without titles, which is rendered as a list."""
+        return cls.of_lines(["", ""], lines)
+
+    def __len__(self) -> int:
+        return len(self.columns[0]) if self.columns else 0
+
+    @property
+    def values(self) -> list[list[Any]]:
+        """Columns as lists of plain values."""
+        return [column if isinstance(column, list) else column.tolist() for column in self.columns]
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return the table as a DataFrame."""
+        import pandas as pd
+
+        frame = pd.DataFrame(dict(zip(self.titles, self.columns, strict=True)))
+        if self.units is not None:
+            frame.attrs["units"] = self.units
+        return frame.set_index(self.titles[0]) if self.is_named else frame
+
+    def to_csv(self) -> str:
+        """Return the table as CSV; an empty field for no value, JSON for a list or an object."""
+        columns = [[_csv_field(value) for value in own] for own in self.values]
+        return csv_text([self.titles, *zip(*columns, strict=True)])
+
+
+def csv_text(rows: Iterable[Iterable[Any]]) -> str:
+    """Return lines of CSV."""
+    file = io.StringIO()
+    csv.writer(file, lineterminator="\n").writerows(rows)
+    return file.getvalue()
+
+
+def _csv_field(value: Any) -> Any:
+    return json.dumps(value) if isinstance(value, list | dict) else None if _is_missing(value) else value
+
+
+def _is_missing(value: Any) -> bool:
+    """Return whether a value is None or not a number."""
+    return value is None or (isinstance(value, float) and math.isnan(value))
+
+
+def _plain_column(values: Iterable[Any]) -> list[Any]:
+    """Return values as plain data; integers as floats if there are also floats, or none for some rows."""
+    plain = [value.item() if hasattr(value, "item") else value for value in values]
+    kinds = {type(value) for value in plain}
+    if int in kinds and len(kinds) > 1 and kinds <= {int, float, type(None)}:
+        return [None if value is None else float(value) for value in plain]
+    return plain
+
+
+@dataclass(frozen=True, eq=False)
 class Section:
     """One part of a result: a title, sentences, a table, and a figure, each of them optional."""
 
     title: str = ""
     sentences: Sequence[str] = ()
-    frame: pd.DataFrame | None = None
-    #: Format of the numbers of a column, such as ``.2f``; ``.6g`` by default.
-    formats: Mapping[str, str] = field(default_factory=dict)
+    table: Table | None = None
     #: Lines that are never wrapped, such as paths and commands.
     lines: Sequence[str] = ()
     #: Sentences below the table, on the meaning of its columns.
@@ -68,16 +171,6 @@ class Section:
     #: A figure to draw, or an SVG file.
     drawing: Drawing | bytes | None = None
     caption: str = ""
-
-    @classmethod
-    def table(cls, rows: Iterable[object], columns: Sequence[Column], **parts: Any) -> Section:
-        """Return a table of objects or mappings; columns without any value are left out."""
-        import pandas as pd
-
-        keys = [column.key for column in columns]
-        frame = pd.DataFrame([picked(row, keys).values() for row in rows], columns=[each.header for each in columns])
-        formats = {column.header: column.form for column in columns}
-        return cls(frame=frame.dropna(axis=1, how="all"), formats=formats, **parts)
 
 
 class Result(ABC):
@@ -104,12 +197,14 @@ class Result(ABC):
         content = self.content()
         return {"schema": self.schema, **content} if self.schema and isinstance(content, dict) else content
 
-    def to_frame(self) -> pd.DataFrame:
+    def main_table(self) -> Table:
         """Return the main table of the result; one row of its content if there is none."""
-        import pandas as pd
+        tables = [section.table for section in self.sections() if section.table is not None]
+        return tables[0] if tables else Table.of_rows([self.content()])
 
-        frames = [section.frame for section in self.sections() if section.frame is not None]
-        return frames[0] if frames else pd.DataFrame([self.content()])
+    def to_frame(self) -> pd.DataFrame:
+        """Return the main table of the result as a DataFrame."""
+        return self.main_table().to_frame()
 
     def plot(self) -> Figure:
         """Draw the main figure of the result."""
@@ -128,22 +223,11 @@ class Result(ABC):
         if form == "text":
             return render_text(self.sections(), columns)
         if form == "csv":
-            frame = self.to_frame().copy()
-            for name, values in frame.select_dtypes(["object", "str"]).items():
-                held = values.map(lambda value: isinstance(value, list | dict)).astype(bool)
-                frame[name] = values.mask(held, values[held].map(json.dumps))
-            return str(frame.to_csv(index=_is_named(frame), lineterminator="\n")).rstrip("\n")
+            return self.main_table().to_csv().rstrip("\n")
         return RENDERERS[form](self.sections())
 
     def _repr_html_(self) -> str:
         return self.write("html")
-
-
-def pairs(rows: Iterable[Sequence[str]]) -> pd.DataFrame:
-    """Return labels and texts as a table without titles, which is rendered as a list."""
-    import pandas as pd
-
-    return pd.DataFrame(rows, columns=["", ""])
 
 
 def cell(value: Any, form: str = ".6g") -> str:
@@ -155,18 +239,12 @@ def cell(value: Any, form: str = ".6g") -> str:
     return "-" if value is None else str(value)
 
 
-def _is_named(frame: pd.DataFrame) -> bool:
-    return frame.index.name is not None
-
-
-def aligned_lines(section: Section) -> tuple[list[list[str]], str]:
+def aligned_lines(table: Table) -> tuple[list[list[str]], str]:
     """Return header and rows of a table as texts, and the side of each column: texts left (l), numbers right (r)."""
-    assert section.frame is not None
-    frame = section.frame.reset_index() if _is_named(section.frame) else section.frame
     columns, sides = [], ""
-    for name, values in frame.items():
-        form = section.formats.get(str(name), ".6g")
-        columns.append([str(name), *(cell(value, form) for value in values.tolist())])
+    for title, values in zip(table.titles, table.values, strict=True):
+        form = table.formats.get(title, ".6g")
+        columns.append([title, *(cell(value, form) for value in values)])
         sides += "r" if all(map(_is_number, columns[-1][1:])) else "l"
     return [list(row) for row in zip(*columns, strict=True)], sides
 
@@ -184,7 +262,7 @@ def render_text(sections: Iterable[Section], columns: int | None = None) -> str:
     for section in sections:
         parts = [_paragraph(section.title, width)] if section.title else []
         parts += [*(_paragraph(sentence, width) for sentence in section.sentences), *section.lines]
-        parts += [_text_table(*aligned_lines(section), columns)] if section.frame is not None else []
+        parts += [_text_table(*aligned_lines(section.table), columns)] if section.table is not None else []
         parts += [_paragraph(note, width) for note in section.notes]
         blocks += ["\n".join(parts)] if parts else []
     return "\n\n".join(blocks)
@@ -246,8 +324,8 @@ def render_markdown(sections: Iterable[Section]) -> str:
     for section in sections:
         blocks += [f"### {section.title}"] if section.title else []
         blocks += [*section.sentences, *section.lines]
-        if section.frame is not None:
-            (header, *rows), sides = aligned_lines(section)
+        if section.table is not None:
+            (header, *rows), sides = aligned_lines(section.table)
             blocks.append(markdown_table(header, rows, sides))
         blocks += section.notes
     return "\n\n".join(blocks)
@@ -259,7 +337,7 @@ def render_latex(sections: Iterable[Section]) -> str:
     for section in sections:
         comments = [*([section.title] if section.title else []), *section.sentences, *section.lines]
         blocks += [f"% {line}" for text in comments for line in text.splitlines()]
-        blocks += [_latex_table(*aligned_lines(section))] if section.frame is not None else []
+        blocks += [_latex_table(*aligned_lines(section.table))] if section.table is not None else []
         blocks += [f"% {line}" for text in section.notes for line in text.splitlines()]
     return "\n\n".join(blocks)
 
@@ -276,7 +354,7 @@ def render_html(sections: Iterable[Section]) -> str:
     for section in sections:
         blocks += [f"<h4>{html.escape(section.title)}</h4>"] if section.title else []
         blocks.append(html_paragraphs([*section.sentences, *section.lines]))
-        blocks += [html_table(*aligned_lines(section))] if section.frame is not None else []
+        blocks += [html_table(*aligned_lines(section.table))] if section.table is not None else []
         blocks.append(html_paragraphs(section.notes))
     return "\n".join(filter(None, blocks))
 

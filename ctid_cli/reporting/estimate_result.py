@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import pandas as pd
-
 from ctid_cli.inference.intervals import BIASED, NORMAL, UncertainValue
 from ctid_cli.kinds import KINDS
-from ctid_cli.reporting.document import Column, Result, Section, pairs
+from ctid_cli.reporting.document import Column, Result, Section, Table
 from ctid_cli.reporting.estimate import PARAMETER, parameter_rows, parameters
 from ctid_cli.reporting.layout import delay_label, number, seconds
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name, measure_names
@@ -70,7 +68,7 @@ class EstimateResult(Result):
         numbers = [self._fitted(), _facts(row)]
         if "measures" in row:
             columns = Column("measure"), Column("value"), Column("unit")
-            numbers = [Section.table(_measures(row), columns, notes=[f"Time: {_times(row)}."])]
+            numbers = [Section(table=Table.of(_measures(row), columns), notes=[f"Time: {_times(row)}."])]
         data = f"Data (cell {row['cell']}, seed {seed}, data set {row['replicate']})"
         return [
             Section(f"Estimate {row['id']} of {row['experiment']}", head),
@@ -79,10 +77,10 @@ class EstimateResult(Result):
             Section("Estimator", _settings(self.slot.estimator["content"])),
         ]
 
-    def to_frame(self) -> pd.DataFrame:
+    def main_table(self) -> Table:
         """Return one row for each parameter, or measure of frequencies."""
         rows = _measures(self.row) if "measures" in self.row else parameter_rows(self.parameters)
-        return pd.DataFrame(rows)
+        return Table.of_rows(rows)
 
     def _fitted(self) -> Section:
         """Return the parameters of a model, and the meaning of their names and intervals."""
@@ -90,9 +88,8 @@ class EstimateResult(Result):
         notes = [f"True delay: {number(row['true_delay'])} s."] if row.get("true_delay") is not None else []
         if not self.parameters:
             return Section(notes=notes)
-        return Section.table(
-            self.parameters,
-            PARAMETER,
+        return Section(
+            table=Table.of(self.parameters, PARAMETER),
             notes=[" ".join([*_conventions([one.name for one in self.parameters]), _interval(row)]), *notes],
         )
 
@@ -119,7 +116,7 @@ def _facts(row: Mapping[str, Any]) -> Section:
         "condition number": number(row["condition_number"], 3),
         "time": _times(row),
     }
-    return Section(frame=pairs(list(facts.items())))
+    return Section(table=Table.of_pairs(facts.items()))
 
 
 def _measures(row: Mapping[str, Any]) -> list[dict[str, str]]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import MachineError
 from ctid_cli.reporting import surprises as unexpected
-from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.document import Result, Section, Table
 from ctid_cli.reporting.figures.experiment_plot import experiment_drawing
 from ctid_cli.reporting.measures import Row, default_measures, measure_frame
 from ctid_cli.reporting.paired_result import compare_estimators
@@ -61,6 +61,10 @@ class ExperimentResults(Results, Result):
     def content(self) -> list[Row]:
         """Return the rows of the table."""
         return self.table.content()
+
+    def main_table(self) -> Table:
+        """Return one row for each estimate."""
+        return Table.of_frame(self.estimates)
 
     def to_frame(self) -> pd.DataFrame:
         """Return one row for each estimate, equal to ``estimates``."""

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from ctid_cli.errors import StorageError
 from ctid_cli.estimators.delay_profile import DelayProfile
@@ -25,7 +24,7 @@ from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.units import Units
 from ctid_cli.models.several_inputs import fractions_of
-from ctid_cli.reporting.document import Section, pairs
+from ctid_cli.reporting.document import Section, Table
 from ctid_cli.reporting.estimate import PARAMETER, parameter_rows
 from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.fit_content import DERIVED, additive_of, derived_of, fit_content, parameters_of
@@ -107,16 +106,16 @@ class FitResult(PagedResult):
         return [
             _titled_list("Chosen:", self.fitted.choices),
             self.data(),
-            Section(frame=pairs(self.settings())),
+            Section(table=Table.of_pairs(self.settings())),
             self.parameters(),
             self.derived(),
-            Section(frame=pairs(self.quality()), drawing=self.drawing()),
+            Section(table=Table.of_pairs(self.quality()), drawing=self.drawing()),
             _titled_list("Warnings:", self.fitted.warnings),
         ]
 
-    def to_frame(self) -> pd.DataFrame:
+    def main_table(self) -> Table:
         """Return a row for each parameter: estimate, standard error, interval, unit and status."""
-        return pd.DataFrame(parameter_rows(parameters_of(self.fitted, self.units))).set_index("name")
+        return Table.of_rows(parameter_rows(parameters_of(self.fitted, self.units)), is_named=True)
 
     def drawing(self) -> Drawing:
         """Return the figure of output, residuals, their correlation, and the search over the delay."""
@@ -149,8 +148,8 @@ class FitResult(PagedResult):
             terms = [(part.numerator.tolist(), part.denominator.tolist(), poles) for part, poles in parts]
             equation = formula(terms, delayed=model.delay > 0, digits=DIGITS)
             equations.append(f"Response to {name}: {equation}" if name else equation)
-        quality = Section("Quality of the fit", frame=pairs(self.quality()))
-        yield Chapter("Data", [self.data(), Section(frame=pairs(self.settings()))])
+        quality = Section("Quality of the fit", table=Table.of_pairs(self.quality()))
+        yield Chapter("Data", [self.data(), Section(table=Table.of_pairs(self.settings()))])
         yield Chapter("Model", [Section(sentences=equations), self.parameters(), self.derived(), quality])
 
     def cited(self) -> list[str]:
@@ -174,7 +173,7 @@ class FitResult(PagedResult):
     def parameters(self) -> Section:
         """Return the parameters with their uncertainty."""
         notes = [f"{self.fitted.errors_sentence} {form_of(self.fitted.fit)}"]
-        return Section.table(parameters_of(self.fitted, self.units), PARAMETER, notes=notes)
+        return Section(table=Table.of(parameters_of(self.fitted, self.units), PARAMETER), notes=notes)
 
     def derived(self) -> Section:
         """Return derived quantities as a table, and why some have no error."""
@@ -185,7 +184,7 @@ class FitResult(PagedResult):
             notes.append(
                 f"The linearised intervals of {listed(below)} contain negative values: the errors are too large."
             )
-        return Section.table(rows, DERIVED, notes=notes)
+        return Section(table=Table.of(rows, DERIVED), notes=notes)
 
     def settings(self) -> Iterator[tuple[str, str]]:
         """Yield the estimator, and the treatment of the records."""

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from ctid_cli.errors import UsageError
 from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
@@ -15,23 +14,23 @@ from ctid_cli.estimators.identification import Identification, models_of
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.model_responses import FrequencyBand, ResponseBand
 from ctid_cli.inference.units import Units
-from ctid_cli.reporting.document import Tool
+from ctid_cli.reporting.document import Table, Tool
 from ctid_cli.reporting.layout import picked
 
 if TYPE_CHECKING:
     from ctid_cli.reporting.fit_result import FitResult
 
 
-def fit_tables(result: FitResult) -> dict[str, pd.DataFrame]:
+def fit_tables(result: FitResult) -> dict[str, Table]:
     """Return the tables of a fit's page by file name; several records are numbered."""
     fitted, units = result.fitted, result.units
     tables = {}
     for k, (name, model) in enumerate(models_of(fitted).items()):
         tail, own = f"_{name}" if name else "", units.of_input(k)
-        tables[f"step{tail}.csv"] = response_frame(model.step_response(), own)
-        tables[f"bode{tail}.csv"] = frequency_frame(model.frequency_response(), own)
+        tables[f"step{tail}.csv"] = response_table(model.step_response(), own)
+        tables[f"bode{tail}.csv"] = frequency_table(model.frequency_response(), own)
     if isinstance(fitted.fit, FrequencyDomainFit):
-        return tables | {"lines.csv": line_frame(fitted.fit, units)}
+        return tables | {"lines.csv": line_table(fitted.fit, units)}
     several = len(result.records.data) > 1
     for k, record in enumerate(result.records.data):
         number, t = f"_{k + 1}" * several, f"t [{units.time}]"
@@ -42,13 +41,13 @@ def fit_tables(result: FitResult) -> dict[str, pd.DataFrame]:
             columns[units.label(label, units.of_input(i).input)] = signal.at(record.t[used])
         columns[units.label("measured", units.output)] = record.y[used]
         columns[units.label("simulated", units.output)] = record.y[used] - residuals
-        tables[f"simulation{number}.csv"] = pd.DataFrame(columns)
+        tables[f"simulation{number}.csv"] = Table.of_columns(columns)
         left = {t: record.t[used], units.label("residual", units.output): residuals}
-        tables[f"residuals{number}.csv"] = pd.DataFrame(left)
+        tables[f"residuals{number}.csv"] = Table.of_columns(left)
     return tables
 
 
-def line_frame(fit: FrequencyDomainFit, units: Units) -> pd.DataFrame:
+def line_table(fit: FrequencyDomainFit, units: Units) -> Table:
     """Return values, model and residuals at each line of a frequency response."""
     data, model = fit.data, fit.responses_at(fit.data.frequencies)
     columns = {f"frequency [rad/{units.time}]": data.frequencies}
@@ -57,25 +56,25 @@ def line_frame(fit: FrequencyDomainFit, units: Units) -> pd.DataFrame:
         columns[units.label(f"{name}imaginary", units.gain)] = values.imag
     if data.standard_error is not None:
         columns[units.label("standard_error", units.gain)] = data.standard_error
-    return pd.DataFrame(columns)
+    return Table.of_columns(columns)
 
 
-def response_frame(band: ResponseBand, units: Units) -> pd.DataFrame:
+def response_table(band: ResponseBand, units: Units) -> Table:
     """Return a response over time with its standard error and pointwise band."""
     values = picked(band, ("value", "standard_error", "lower", "upper"))
-    return pd.DataFrame(
+    return Table.of_columns(
         {f"t [{units.time}]": band.t} | {units.label(part, units.gain): value for part, value in values.items()}
     )
 
 
-def frequency_frame(band: FrequencyBand, units: Units) -> pd.DataFrame:
+def frequency_table(band: FrequencyBand, units: Units) -> Table:
     """Return a frequency response as complex numbers, and as gain and phase with their pointwise bands."""
     columns = {f"frequency [rad/{units.time}]": band.frequencies}
     gains = {"real": band.value.real, "imaginary": band.value.imag}
     gains |= picked(band, ("gain", "gain_error", "gain_lower", "gain_upper"))
     phases = picked(band, ("phase", "phase_error", "phase_lower", "phase_upper"))
     columns |= {units.label(name, units.gain): values for name, values in gains.items()}
-    return pd.DataFrame(columns | {f"{name} [deg]": np.rad2deg(values) for name, values in phases.items()})
+    return Table.of_columns(columns | {f"{name} [deg]": np.rad2deg(values) for name, values in phases.items()})
 
 
 def model_code(fit: FittedModel, tool: Tool, time_unit: str, pade: int | None = None) -> tuple[str, str]:

@@ -13,7 +13,7 @@ from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.identification.sentences import spelled
 from ctid_cli.inference.units import Units
-from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.document import Section, Table
 from ctid_cli.reporting.estimate import PARAMETER
 from ctid_cli.reporting.figures.style import BAND, DARK, MIDDLE, Drawing, name_axes
 from ctid_cli.reporting.figures.style import plain as plain_text
@@ -85,7 +85,7 @@ class FrequencyFitResult(FitResult):
     def parameters(self) -> Section:
         """Return the parameters with their uncertainty."""
         notes = [f"{self._errors()} {form_of(self.fit)}"]
-        return Section.table(parameters_of(self.fitted, self.units), PARAMETER, notes=notes)
+        return Section(table=Table.of(parameters_of(self.fitted, self.units), PARAMETER), notes=notes)
 
     def _errors(self) -> str:
         """Return the assumptions of the standard errors."""

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.frequency_response import FrequencyResponse
 from ctid_cli.inference.units import Units
-from ctid_cli.reporting.document import Column, Result, Section
+from ctid_cli.reporting.document import Column, Result, Section, Table
 from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.frf_plot import frf_drawing
 from ctid_cli.reporting.layout import picked
@@ -49,9 +48,10 @@ class FrequencyResponseResult(Result):
         head = f"{self.records.line}; frequency response by {METHODS[found.method]}, {span}"
         notes = [f"- {note}" for note in (*found.notes, *self.records.notes)]
         places = np.searchsorted(found.frequencies, np.geomspace(low, high, ROWS)).clip(max=found.frequencies.size - 1)
-        rows = pd.DataFrame(self._values()).iloc[np.unique(places)].to_dict("records")
+        values = self._values()
+        rows = [{key: own[place] for key, own in values.items()} for place in np.unique(places)]
         printed = [column for column in quantities(units) if column.key in PRINTED]
-        return [Section("", [head, *notes]), Section.table(rows, printed, drawing=self.drawing())]
+        return [Section("", [head, *notes]), Section(table=Table.of(rows, printed), drawing=self.drawing())]
 
     def drawing(self) -> Drawing:
         """Return the figure of gain, phase and coherence."""
@@ -76,7 +76,7 @@ class FrequencyResponseResult(Result):
         }
         return values if found.distortion is None else values | {"distortion": np.sqrt(found.distortion)}
 
-    def to_frame(self) -> pd.DataFrame:
+    def main_table(self) -> Table:
         """Return all frequencies, with 95 % intervals."""
         names, found = {column.key: column.name for column in quantities(self.records.units)}, self.found
         # Attributes that a fit to the table uses.
@@ -85,7 +85,7 @@ class FrequencyResponseResult(Result):
             "hold_interval": np.full(found.frequencies.size, found.interval or np.nan),
             "correlated": np.full(found.frequencies.size, found.method != "periodic"),
         }
-        return pd.DataFrame({names[key]: values for key, values in (self._values() | attributes).items()})
+        return Table.of_columns({names[key]: values for key, values in (self._values() | attributes).items()})
 
     def content(self) -> dict[str, Any]:
         """Return the response for JSON."""

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Candidate, Searched
 from ctid_cli.identification.sentences import spelled
 from ctid_cli.identification.validation import CandidateDiagnostics, diagnosed
-from ctid_cli.reporting.document import Column, Result, Section
+from ctid_cli.reporting.document import Column, Result, Section, Table
 from ctid_cli.reporting.figures.style import LOOKS, MARK, Drawing, name_axes, plain
 from ctid_cli.reporting.layout import picked
 from ctid_cli.reporting.records import Records
@@ -64,7 +63,7 @@ class OrderSearchResult(Result):
             notes.append(f"- The best {ROWS} of {len(self.candidates)} structures; all are in order.json.")
         return [
             Section("", [self.records.line, verdict]),
-            self._table(ROWS, drawing=self.drawing()),
+            Section(table=self._table(ROWS), drawing=self.drawing()),
             Section("", notes),
         ]
 
@@ -104,13 +103,11 @@ class OrderSearchResult(Result):
         names = ", ".join(Path(each.record.name).name for each in self.records.measurements)
         error.set_title(plain(names), loc="left")
 
-    def to_frame(self) -> pd.DataFrame:
+    def main_table(self) -> Table:
         """Return one row for each structure, the best first; the criterion is relative to that of the first row."""
-        frame = self._table().frame
-        assert frame is not None
-        return frame.set_index("chosen")
+        return replace(self._table(), is_named=True)
 
-    def _table(self, most: int | None = None, **parts: Any) -> Section:
+    def _table(self, most: int | None = None) -> Table:
         """Return the best structures."""
         names = OF_A_SUM if isinstance(self.choice.options, AdditiveOutputError) else STRUCTURE
         columns = (
@@ -126,7 +123,7 @@ class OrderSearchResult(Result):
         if marks and self.choice.has_model:
             marks[0] = "*"
         marked = [row | {"chosen": mark} for row, mark in zip(rows, marks, strict=True)]
-        return Section.table(marked, columns, **parts)
+        return Table.of(marked, columns)
 
     def content(self) -> dict[str, Any]:
         """Return the structures for ``order.json``."""

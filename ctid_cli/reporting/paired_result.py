@@ -20,7 +20,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.inference.monte_carlo import MEASURES
 from ctid_cli.inference.paired import hit_difference, holm, median_difference, rms_difference
 from ctid_cli.progress import reported
-from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.document import Section, Table
 from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.measures import Row, label_frame, parameter_unit, parts_of, records_of, values_of
 from ctid_cli.reporting.results import Results, out_option
@@ -52,7 +52,8 @@ def compare_estimators(results: Results, names: str, out: Path) -> TableResult:
         raise UsageError(f"{results.experiment}: {first} and {second} have fewer than {FEWEST} data sets in common")
     frame = pd.DataFrame(rows, dtype=object)
     measured = [name for name in METHODS if (frame["measure"] == name).any()]
-    tables = [Section(frame=_table(frame[frame["measure"] == name].dropna(axis=1, how="all"))) for name in measured]
+    parts = [frame[frame["measure"] == name].dropna(axis=1, how="all") for name in measured]
+    tables = [Section(table=Table.of_frame(_table(part))) for part in parts]
     methods = "; ".join(METHODS[name] for name in measured)
     families = "; ".join(frame["family"].unique())
     foot = f"First minus second, 95 % intervals: {methods}. p: adjusted by Holm over the {families}."

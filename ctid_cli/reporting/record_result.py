@@ -6,13 +6,10 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
-import pandas as pd
-
 from ctid_cli.identification.record_findings import Finding, Level, findings
 from ctid_cli.inference.record_facts import RecordFacts
 from ctid_cli.inference.response_estimates import Estimate
-from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.document import Result, Section, Table
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.table import ROLES
 from ctid_cli.text import count
@@ -50,7 +47,7 @@ class RecordCheckResult(Result):
         return [
             Section("", [head, *measurement.notes]),
             Section("", found),
-            Section(frame=self.to_frame(), formats=dict.fromkeys(NUMBERS, ".4g")),
+            Section(table=self.main_table()),
             Section("", [] if self.command is None else [f"next:\n    {self.command}"]),
         ]
 
@@ -66,10 +63,10 @@ class RecordCheckResult(Result):
         """Level of the worst fact."""
         return self.findings[0].level
 
-    def to_frame(self) -> pd.DataFrame:
+    def main_table(self) -> Table:
         """Return the numbers of the record with their units; low and high of estimates are 95 % intervals."""
         facts, time = self.facts, self.measurement.time_unit or "s"
-        none, frequency, output = np.nan, f"rad/{time}", self.measurement.output_unit
+        none, frequency, output = math.nan, f"rad/{time}", self.measurement.output_unit
         jitter = 0.0 if facts.regular else facts.interval_deviation
         parts = facts.parts
         terms = [
@@ -85,8 +82,9 @@ class RecordCheckResult(Result):
             ("delay", *_row(parts.delay), time),
             *((name, term.value, none, term.low, term.high, output) for name, term in terms),
         ]
-        frame = pd.DataFrame(rows, columns=["quantity", *NUMBERS, "unit"]).set_index("quantity")
-        return frame.fillna({"unit": ""}).dropna(how="all", subset=list(NUMBERS))
+        known = [(*row[:-1], row[-1] or "") for row in rows if not all(map(math.isnan, row[1:-1]))]
+        titles, formats = ["quantity", *NUMBERS, "unit"], dict.fromkeys(NUMBERS, ".4g")
+        return Table.of_lines(titles, known, formats=formats, is_named=True)
 
     def content(self) -> dict[str, Any]:
         """Return facts and command for JSON."""

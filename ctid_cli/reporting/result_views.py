@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from ctid_cli.errors import UsageError
 from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
@@ -15,7 +14,7 @@ from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.frequency.flags import flag_names
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.intervals import UncertainValue
-from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.document import Result, Section, Table
 from ctid_cli.reporting.estimate import PARAMETER, parameter_rows
 from ctid_cli.reporting.fit_result import FitResult
 from ctid_cli.reporting.frequency_fit import FrequencyFitResult
@@ -46,7 +45,7 @@ class SingleFit(Result):
         fit = self.fit
         note = f"fit {number(fit.fit_percent, 5)} % of {fit.count} samples: {fit.status.value}"
         return [
-            Section.table(self._parameters(), PARAMETER),
+            Section(table=Table.of(self._parameters(), PARAMETER)),
             Section(sentences=[note]),
         ]
 
@@ -56,9 +55,9 @@ class SingleFit(Result):
         parameters = parameter_rows(self._parameters())
         return {"parameters": parameters, "fit_percent": fit.fit_percent, "status": fit.status.name}
 
-    def to_frame(self) -> pd.DataFrame:
+    def main_table(self) -> Table:
         """Return a row for each parameter."""
-        return pd.DataFrame(parameter_rows(self._parameters())).set_index("name")
+        return Table.of_rows(parameter_rows(self._parameters()), is_named=True)
 
     def plot(self) -> Any:
         """Refuse to plot: there is no record to draw."""
@@ -83,7 +82,7 @@ class OnlineTrackResult(TrackResult):
         every = float(track.t[1] - track.t[0]) if track.t.size > 1 else 0.0
         return cls(Track.of(track.t, track.frequencies, track.flags, every))
 
-    def to_frame(self) -> pd.DataFrame:
+    def main_table(self) -> Table:
         """Return a row for each instant: frequencies [rad/s] and [Hz], whether all are valid, and flags by name."""
         track = self.track
         names = [f"omega_{k + 1}" for k in range(track.omega.shape[1])]
@@ -91,4 +90,4 @@ class OnlineTrackResult(TrackResult):
         columns |= {f"frequency_{k + 1}_hz": column / TURN for k, column in enumerate(track.omega.T)}
         flags = np.bitwise_or.reduce(track.flags, axis=1)
         columns |= {"valid": track.valid.all(axis=1), "flags": flag_names(flags)}
-        return pd.DataFrame(columns).set_index("t")
+        return Table.of_columns(columns, is_named=True)

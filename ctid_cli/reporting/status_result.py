@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from ctid_cli.inference.monte_carlo import CellPrecision, Widest
-from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.document import Result, Section, Table
 from ctid_cli.reporting.layout import number, picked, rate
 from ctid_cli.reporting.measures import SUCCESSES
 from ctid_cli.reporting.results import out_option
@@ -63,28 +62,27 @@ class StatusResult(Result):
         head = f"{self.name} in {status.folder}: {status.done} of {status.planned} estimates done"
         sections = [Section(sentences=[head + (f" ({self.remark})" if self.remark else "")])]
         if status.groups:
-            columns = ["estimator", "done", "planned", "failed"]
-            groups = pd.DataFrame(
-                [{**picked(each, columns[:1]), **each.swept, **picked(each, columns[1:])} for each in status.groups]
-            )
-            sections.append(Section(frame=groups))
-        sections += [Section(frame=precision_frame(self.precision))] if self.precision else []
+            counts = ("done", "planned", "failed")
+            groups = [{"estimator": each.estimator, **each.swept, **picked(each, counts)} for each in status.groups]
+            sections.append(Section(table=Table.of_rows(groups)))
+        sections += [Section(table=precision_table(self.precision))] if self.precision else []
         if self.stored is not None:
             found = self.outcomes()
-            shown = found.head(LISTED)
-            notes = [f"{id}: {reason}" for id, reason in zip(shown["first"], shown["reason"], strict=True) if reason]
+            shown = found[:LISTED]
+            notes = [f"{each['first']}: {each['reason']}" for each in shown if each["reason"]]
             notes += [f"and {len(found) - LISTED} more"] if len(found) > LISTED else []
-            sections += [Section(frame=shown.drop(columns="reason")), Section(notes=notes)]
+            table = Table.of_rows([picked(each, ("estimator", "status", "estimates", "first")) for each in shown])
+            sections += [Section(table=table), Section(notes=notes)]
         if status.left_aside:
             aside = f"{status.left_aside} stored estimates are set aside: the latest run has other settings."
             aside += " To see them, run their specification again; nothing is computed anew."
             sections.append(Section(sentences=[aside]))
         return [*sections, Section(sentences=self._next())]
 
-    def outcomes(self) -> pd.DataFrame:
+    def outcomes(self) -> list[dict[str, Any]]:
         """Return the number of estimates of each estimator, status and reason."""
         assert self.stored is not None
-        return outcome_frame(self.stored)
+        return outcomes_of(self.stored)
 
     def _next(self) -> list[str]:
         """Return the suggested next steps."""
@@ -104,7 +102,7 @@ class StatusResult(Result):
         if self.precision:
             content["precision"] = [asdict(cell) for cell in self.precision]
         if self.stored is not None:
-            content["outcomes"] = self.outcomes().to_dict("records")
+            content["outcomes"] = self.outcomes()
         return content
 
 
@@ -123,13 +121,15 @@ class Overview(Result):
                     sentences=[f"There are no results in {self.out}. To make some: ctid run configs/quickstart.yaml"]
                 )
             ]
-        return [Section(frame=self.to_frame())]
+        return [Section(table=self.main_table())]
 
-    def to_frame(self) -> pd.DataFrame:
+    def main_table(self) -> Table:
         """Return one row for each experiment."""
-        counts = ("done", "planned", "failed", "left_aside")
-        rows = [{"experiment": one.name, **picked(one.status, counts), "": one.remark} for one in self.experiments]
-        return pd.DataFrame(rows, dtype=object).rename(columns={"left_aside": "set aside"})
+        rows = []
+        for one in self.experiments:
+            counts = picked(one.status, ("done", "planned", "failed"))
+            rows.append({"experiment": one.name, **counts, "set aside": one.status.left_aside, "": one.remark})
+        return Table.of_rows(rows)
 
     def content(self) -> list[dict[str, Any]]:
         """Return the status of every experiment."""
@@ -150,31 +150,40 @@ def _running(progress: Mapping[str, Any]) -> str:
     return ", ".join(words)
 
 
-def outcome_frame(stored: Estimates) -> pd.DataFrame:
+def outcomes_of(stored: Estimates) -> list[dict[str, Any]]:
     """Return the number of estimates of each estimator, status and reason, and the id of the first of them.
 
     The reason is the first line of the message, which continues with places in the code; successes have none.
     """
-    frame = pd.DataFrame({name: _categories(stored.column(name)) for name in ("estimator", "status")}).assign(reason="")
-    failed = ~frame["status"].isin(SUCCESSES).to_numpy()
-    frame.loc[failed, "reason"] = [text.partition("\n")[0] for text in stored.chosen(failed).values("message")]
-    by = frame.reset_index().groupby(["estimator", "status", "reason"], sort=False, observed=True)["index"]
-    groups = by.agg(estimates="size", first="first").reset_index()
-    groups["first"] = np.char.decode(stored.column("id")[groups["first"]])
-    groups = groups.astype({"estimator": "str", "status": "str"})
-    return groups.sort_values("estimates", ascending=False, kind="stable", ignore_index=True)
-
-
-def _categories(texts: Any) -> Any:
-    """Return texts of few different values in little memory."""
-    labels, codes = np.unique(texts, return_inverse=True)
-    return pd.Categorical.from_codes(codes, pd.Index([label.decode() for label in labels.tolist()]))
+    names, of_name = np.unique(stored.column("estimator"), return_inverse=True)
+    states, of_state = np.unique(stored.column("status"), return_inverse=True)
+    failed = ~np.isin(states, [status.encode() for status in SUCCESSES])[of_state]
+    reasons, of_reason = {"": 0}, np.zeros(of_state.size, dtype=int)
+    texts = (text.partition("\n")[0] for text in stored.chosen(failed).values("message"))
+    of_reason[failed] = [reasons.setdefault(text, len(reasons)) for text in texts]
+    shape = names.size, states.size, len(reasons)
+    groups = np.ravel_multi_index((of_name, of_state, of_reason), shape)
+    found, first, sizes = np.unique(groups, return_index=True, return_counts=True)
+    # The most frequent first; equally frequent ones in the order of their first estimates.
+    order = np.lexsort((first, -sizes))
+    places = zip(*np.unravel_index(found[order], shape), strict=True)
+    ids, shown = np.char.decode(stored.column("id")[first[order]]), list(reasons)
+    return [
+        {
+            "estimator": names[name].decode(),
+            "status": states[state].decode(),
+            "reason": shown[reason],
+            "estimates": size,
+            "first": one,
+        }
+        for (name, state, reason), size, one in zip(places, sizes[order].tolist(), ids.tolist(), strict=True)
+    ]
 
 
 # --- precision ------------------------------------------------------------------------------------------------------
 
 
-def precision_frame(cells: Sequence[CellPrecision]) -> pd.DataFrame:
+def precision_table(cells: Sequence[CellPrecision]) -> Table:
     """Return every data cell with its widest interval."""
     rows = []
     for cell in cells:
@@ -183,7 +192,7 @@ def precision_frame(cells: Sequence[CellPrecision]) -> pd.DataFrame:
         counts = {"data sets": cell.finished, "needed": cell.needed}
         shown = dict(zip(("widest interval", "half-width", "required"), widest, strict=True))
         rows.append({**cell.swept, **counts, **shown, "": _STATES[cell.state]})
-    return pd.DataFrame(rows)
+    return Table.of_rows(rows)
 
 
 def block_sentence(cells: Sequence[CellPrecision]) -> str:
@@ -239,8 +248,8 @@ class VerificationResult(Result):
     def sections(self) -> list[Section]:
         """Return a line for each file."""
         verdict = "intact" if self.found.is_intact else "DAMAGED"
-        files = pd.DataFrame([asdict(finding) for finding in self.found.findings])
-        return [Section(f"{self.content()['experiment']}: {verdict}", frame=files)]
+        files = Table.of_rows([asdict(finding) for finding in self.found.findings])
+        return [Section(f"{self.content()['experiment']}: {verdict}", table=files)]
 
     def content(self) -> dict[str, Any]:
         """Return the findings for JSON."""

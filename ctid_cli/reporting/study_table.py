@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.document import Section, Table
 from ctid_cli.reporting.layout import delay_label, number, seconds
 from ctid_cli.reporting.measures import percentage_frame, records_of, settings_of, with_types
 from ctid_cli.reporting.results import (
@@ -186,8 +186,8 @@ def study_sections(study: Study, table: StudyTable, frame: pd.DataFrame, options
     pooled = pooled_frame(study, table, frame, options)
     return [
         Section(f"Table {table.number}. {table.title}", [f"Counted: {study.success}."]),
-        Section(frame=_lines_by_delay(frame)),
-        Section(sentences=["All cells of the table together:"], frame=pooled.drop(columns="converged")),
+        Section(table=Table.of_frame(_lines_by_delay(frame))),
+        Section("", ["All cells of the table together:"], Table.of_frame(pooled.drop(columns="converged"))),
         Section(notes=[foot, legend]),
     ]
 

@@ -12,7 +12,7 @@ import pandas as pd
 from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.inference.monte_carlo import Measure
 from ctid_cli.progress import reported
-from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.document import Result, Section, Table
 from ctid_cli.reporting.estimate import parameters
 from ctid_cli.reporting.layout import (
     delay_label,
@@ -84,6 +84,11 @@ class TableResult(Result):
     def content(self) -> list[Row]:
         """Return the rows for JSON."""
         return list(self.rows)
+
+    def main_table(self) -> Table:
+        """Return the rows, a column for each key that any of them has."""
+        titles = list(dict.fromkeys(key for row in self.rows for key in row))
+        return Table(titles, [[row.get(title) for row in self.rows] for title in titles])
 
     def to_frame(self) -> pd.DataFrame:
         """Return the rows, a column for each key that any of them has."""
@@ -179,9 +184,9 @@ def experiment_table(results: Results, remarks: Sequence[str] = ()) -> TableResu
         texts = {title_of(key): [number(value, 3) for value in frame[key]] for key in measured}
         table = labels_of(frame, "method").join(cells.drop(columns="time")).assign(**texts, time=cells["time"])
         alarms = " alarms: false ones, in all data sets together." if "false_alarms" in frame else ""
-        shown = [Section(frame=table), Section(notes=[f"{meaning}{SETTLING}{alarms} {TIME}."])]
+        shown = [Section(table=Table.of_frame(table)), Section(notes=[f"{meaning}{SETTLING}{alarms} {TIME}."])]
     else:
-        tables = [Section(frame=table) for table in _by_estimator(results, frame, cells)]
+        tables = [Section(table=Table.of_frame(table)) for table in _by_estimator(results, frame, cells)]
         shown = [*tables, Section(notes=[f"{meaning}{TIME}."])]
     return TableResult(records_of(frame), [head, *shown], remarks)
 
@@ -237,7 +242,7 @@ def measure_table(results: Results, names: Sequence[str], remarks: Sequence[str]
         tables.setdefault("poles" if name.endswith(":poles") else kind, []).append(name)
     present = frame[(frame["measure"] != "failures") | (frame["value"] != 0)]
     parts = [part for own in tables.values() if len(part := present[present["measure"].isin(own)])]
-    shown = [Section(frame=_measured(part, measures)) for part in parts]
+    shown = [Section(table=Table.of_frame(_measured(part, measures))) for part in parts]
     meant = {name.partition(":")[0]: measure.meaning for name, measure in measures.items()}
     meanings = "; ".join(f"{name}: {meaning}" for name, meaning in meant.items())
     foot = f"{meanings}. ± is one Monte Carlo standard error, [ ] a 95 % interval; --format csv and json have both."
@@ -322,7 +327,7 @@ def _record_sections(results: Results) -> list[Section]:
     lines = [("id", ""), ("status", ""), *names, *fits, ("time", "")]
     table = pd.DataFrame(columns).reindex(pd.MultiIndex.from_tuples(lines, names=["", "unit"])).fillna("-")
     blocks = [table[some] for some in _blocks([*table], ESTIMATES_PER_BLOCK)]
-    sections = [Section(frame=block[(block != "-").any(axis=1)].reset_index()) for block in blocks]
+    sections = [Section(table=Table.of_frame(block[(block != "-").any(axis=1)].reset_index())) for block in blocks]
     foot = "± is one standard error. Fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x."
     return [Section(results.experiment), *sections, Section(notes=[foot])]
 

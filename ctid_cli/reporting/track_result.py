@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from ctid_cli.frequency.flags import flag_names
-from ctid_cli.reporting.document import Column, Section
+from ctid_cli.reporting.document import Column, Section, Table
 from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.layout import number, with_error
 from ctid_cli.reporting.pages.page import Chapter, PagedResult, shown
@@ -87,7 +86,7 @@ class TrackResult(PagedResult):
         note += "how far a tone moves."
         note += " ± is the standard error of the mean frequency." if np.isfinite(track.error).any() else ""
         note += " Valid is a share of the rows where the tone is there." if partly else ""
-        return [Section.table(rows, columns, notes=[note, *self._changes()])]
+        return [Section(table=Table.of(rows, columns), notes=[note, *self._changes()])]
 
     def _changes(self) -> Iterator[str]:
         """Yield amplitudes that grow or decay much, from the first to the last tenth of the valid rows of the tone."""
@@ -149,8 +148,8 @@ class TrackResult(PagedResult):
         rule = f"a row is valid only if the standard error of its frequency is at most {limit} (--accuracy HZ)."
         return [*self.track.reasons, f"Accuracy: {rule}"]
 
-    def to_frame(self) -> pd.DataFrame:
-        """Return the tones over time, those of one after those of another; ``attrs["units"]`` has units of columns."""
+    def main_table(self) -> Table:
+        """Return the tones over time, those of one after those of another."""
         track, unit = self.track, None if self.signal is None else self.signal.unit
         columns: dict[str, NDArray[Any]] = {"t": (self.signal.start if self.signal else 0.0) + track.t}
         units: dict[str, str | None] = {"t": "s"}
@@ -169,9 +168,7 @@ class TrackResult(PagedResult):
         for k in range(track.omega.shape[1]):
             columns |= {name.format(k + 1): values[:, k] for name, (values, _) in quantities.items()}
             units |= {name.format(k + 1): unit for name, (_, unit) in quantities.items()}
-        frame = pd.DataFrame(columns)
-        frame.attrs["units"] = units
-        return frame
+        return Table.of_columns(columns, units=units)
 
     def content(self) -> dict[str, Any]:
         """Return the track for JSON, without its rows."""

@@ -1,5 +1,6 @@
 """Checks of untrusted files: ordinary files only, of bounded size, in allowed folders."""
 
+import hashlib
 import os
 import stat
 from pathlib import Path
@@ -56,3 +57,15 @@ def is_inside(path: str | os.PathLike[str], folder: Path) -> bool:
 def quoted(text: str) -> str:
     """Return text from a file in a form for messages: short, on one line."""
     return repr(text) if len(text) <= MAX_LETTERS else f"a text of {len(text)} characters"
+
+
+def file_sha256(path: str) -> str:
+    """Return the content hash of a file."""
+    if not Path(path).exists():
+        raise DataError(f"{path}: there is no such file; paths are relative to the folder of the specification")
+    require_file(path)
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise DataError(f"{path}: the file cannot be read: {error.strerror or error}") from None

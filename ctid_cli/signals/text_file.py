@@ -45,6 +45,8 @@ NUMBERS = {
     sign: re.compile(rf"[+-]?(\d+{mark}?\d*|{mark}\d+)(e[+-]?\d+)?|[+-]?inf(inity)?|true|false", re.IGNORECASE)
     for sign, mark in ((".", r"\."), (",", ","))
 }
+#: A number that is not missing, not infinite, and no truth value.
+PLAIN = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,2})?")
 NO_DATA = "the file has a header and no data"
 TEXT = "this is not a text file in UTF-8, or in UTF-16 with a byte order mark"
 FORMATS = "records are read from text (.csv, .txt), MATLAB files (.mat) and HDF5 files (.h5)"
@@ -240,9 +242,10 @@ def _all_numbers(fields: Sequence[str]) -> bool:
 def _read_columns(layout: Layout, names: Sequence[str]) -> Found:
     """Read some columns; lines with only empty fields are left out."""
     places, width = [layout.columns.index(name) for name in names], len(layout.columns)
-    parts: list[Any] = []
+    plain = _plain_numbers(layout, places)
+    parts: list[Any] = [] if plain is None else [plain]
     try:
-        for frame in _chunks(layout, places):
+        for frame in _chunks(layout, places) if plain is None else ():
             if frame[width].notna().any():
                 raise ValueError("a line has too many fields")
             parts.append(_numbers(layout, frame[places]).T)
@@ -270,6 +273,25 @@ def _read_columns(layout: Layout, names: Sequence[str]) -> Found:
     if not len(lines):
         raise layout.error(layout.header + 1, NO_DATA)
     return Found(dict(zip(names, values, strict=True)), Rows(os.fspath(layout.path), lines), tuple(notes))
+
+
+def _plain_numbers(layout: Layout, places: Sequence[int]) -> Array | None:
+    """Return columns of a small file of plain numbers only, shape (columns, rows); None for any other file.
+
+    pandas would read the same numbers, the nearest ones, but its import takes a third of a second.
+    """
+    with layout.opened() as file:
+        text = file.read(HEAD_BYTES + 1)
+    if len(text) > HEAD_BYTES or layout.decimal != "." or '"' in text:
+        return None
+    lines = text.replace("\r\n", "\n").removesuffix("\n")
+    rows = [line.split(None if layout.separator == " " else layout.separator) for line in lines.split("\n")]
+    if "\r" in lines or any(len(row) != len(layout.columns) for row in rows):
+        return None
+    columns = [[row[place] for row in rows] for place in places]
+    if not all(map(PLAIN.fullmatch, chain.from_iterable(columns))):
+        return None
+    return np.array([list(map(float, column)) for column in columns])
 
 
 def _numbers(layout: Layout, frame: "DataFrame") -> Array:

@@ -1,7 +1,6 @@
 """Data sets: the record that estimators are given, and its source."""
 
 import dataclasses
-import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,7 +23,7 @@ from ctid_cli.models.several_inputs import MultiInputModel, SystemModel, parts_o
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.excitation import Excitation
-from ctid_cli.signals.files import COPIES, require_file
+from ctid_cli.signals.files import COPIES, file_sha256
 from ctid_cli.signals.held import HeldSignal, Hold, regular_interval
 from ctid_cli.signals.measurement import Offset, read_measurement
 from ctid_cli.signals.noise import stream
@@ -436,18 +435,6 @@ def located(options: Any, folder: Path) -> Any:
     if is_custom(options) or not hasattr(options, "file"):
         return options
     return dataclasses.replace(options, file=joined(folder, options.file))
-
-
-def file_sha256(path: str) -> str:
-    """Return the content hash of a file."""
-    if not Path(path).exists():
-        raise DataError(f"{path}: there is no such file; paths are relative to the folder of the specification")
-    require_file(path)
-    try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise DataError(f"{path}: the file cannot be read: {error.strerror or error}") from None
 
 
 def require_content(path: str, sha256: str) -> str:

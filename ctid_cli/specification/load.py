@@ -9,9 +9,9 @@ from pydantic import ValidationError
 from ctid_cli.custom_code import is_shipped
 from ctid_cli.errors import DataError, RefusedError, SpecError
 from ctid_cli.kinds import KINDS, resolve
-from ctid_cli.signals.files import is_inside
+from ctid_cli.signals.files import file_sha256, is_inside
 from ctid_cli.signals.measurement import read_held_signal
-from ctid_cli.simulation.dataset import LoopOptions, file_sha256, joined, located
+from ctid_cli.simulation.dataset import LoopOptions, joined, located
 from ctid_cli.specification.custom_sections import names_code
 from ctid_cli.specification.joint_checks import joint_violations, joint_warnings, too_many_cases
 from ctid_cli.specification.messages import Violation, explained, shown

@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 from pydantic_core import from_json
 
-from ctid_cli.canonical import canonical_json
+from ctid_cli.canonical import canonical_json, read_json
 from ctid_cli.errors import CtidError, DataError, StorageError
 from ctid_cli.progress import reported
 from ctid_cli.signals.files import require_file
@@ -186,8 +186,8 @@ class Export:
             plan = bytes(file["manifest"][()])
             if hashlib.sha256(plan).hexdigest() != file["manifest"].attrs["sha256"]:
                 raise ValueError("its plan is not what was written")
-            self.manifest = plans.require_manifest(plans.read_json(plan.decode("utf-8")))
-            self.origins = tuple(Origin.of(**entry) for entry in plans.read_json(str(file.attrs["origins"])))
+            self.manifest = plans.require_manifest(read_json(plan.decode("utf-8")))
+            self.origins = tuple(Origin.of(**entry) for entry in read_json(str(file.attrs["origins"])))
             self._group = file["estimates"]
             self.count = int(self._group["replicate"].shape[0])
             for column in (_ESTIMATOR_HASH, *columns.COLUMNS):

@@ -21,11 +21,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctid_cli.canonical import canonical_json
+from ctid_cli.canonical import canonical_json, read_json
 from ctid_cli.errors import DamageError
 from ctid_cli.storage import sqlite_file
 from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.manifest import Key, Manifest, Outcome, Slot, planned_parts, read_json, require_manifest
+from ctid_cli.storage.manifest import Key, Manifest, Outcome, Slot, planned_parts, require_manifest
 from ctid_cli.written_files import write_file
 
 #: Time that a reader waits for a readable state of the file [s].

@@ -8,13 +8,12 @@ its place in the plan and the number of shards, and does not change when ``runs`
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import lcm
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from ctid_cli.errors import UsageError
 from ctid_cli.storage import columns
@@ -101,15 +100,6 @@ def owner(cell: int, replicate: int, cells: int, of: int) -> int:
     # Assigned in turn, if the number of cells has a factor in common with the number of shards, some shards would
     # always get the same cells; so each pass through both starts one shard later.
     return (index + index // lcm(cells, of)) % of + 1
-
-
-def read_json(text: str) -> Any:
-    """Parse JSON; refuse numbers that are not valid JSON."""
-
-    def refuse(constant: str) -> NoReturn:
-        raise ValueError(f"{constant} is no JSON number")
-
-    return json.loads(text, parse_constant=refuse)
 
 
 def require_manifest(found: Any) -> Manifest:

@@ -21,12 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ctid_cli
-from ctid_cli.canonical import content_hash
+from ctid_cli.canonical import content_hash, read_json
 from ctid_cli.errors import DataError
 from ctid_cli.inference.fit import DeferredFields
-from ctid_cli.signals.files import require_file
-from ctid_cli.simulation.dataset import file_sha256
-from ctid_cli.storage.manifest import read_json
+from ctid_cli.signals.files import file_sha256, require_file
 
 #: Maximum size of a file that is read [bytes]; ten thousand bootstrap draws need less.
 MAX_BYTES = 200_000_000

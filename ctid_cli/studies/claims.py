@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from ctid_cli.progress import each
-from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.document import Result, Section, Table
 from ctid_cli.reporting.layout import picked
 from ctid_cli.reporting.study import last_part
 from ctid_cli.studies.catalogue import StudyResults
@@ -72,12 +72,9 @@ class CheckedClaims(Result):
 
     def sections(self) -> list[Section]:
         """Return the claims."""
-        import pandas as pd
-
         columns = ("experiment", "claim", "measured", "required")
         rows = [{**picked(claim, columns), "holds": claim.verdict} for claim in self.claims]
-        frame = pd.DataFrame(rows, columns=[*columns, "holds"])
-        return [Section(self.results.study.name, frame=frame, notes=[self.counted])]
+        return [Section(self.results.study.name, table=Table.of_rows(rows), notes=[self.counted])]
 
 
 def check_claims(found: StudyResults) -> CheckedClaims:

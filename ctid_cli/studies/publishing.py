@@ -70,7 +70,7 @@ def publish(checked: CheckedClaims, out: Path) -> None:
     found, target = checked.results, checked.results.study.published
     commit = commit_of(found)
     texts = published_texts(found)
-    claims = Section(frame=checked.to_frame(), notes=[checked.counted])
+    claims = Section(table=checked.main_table(), notes=[checked.counted])
     texts |= {"claims.md": render_markdown([claims]) + "\n", "claims.csv": checked.write("csv") + "\n"}
     sessions = {short: public_sessions(results.folder) for short, results in found.experiments.items()}
     texts["environment.json"] = json.dumps({"commit": commit, "sessions": sessions}, indent=2) + "\n"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import ctid_cli
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.document import Section, Table
 from ctid_cli.reporting.pages.experiment_page import experiment_page
 from ctid_cli.reporting.pages.page import Chapter, sections_of, shown, write_page
 from ctid_cli.reporting.results import experiments_in, out_option, read_results
@@ -63,14 +63,12 @@ def study_page(study: Study, out: Path) -> str:
 
 
 def _question(study: Study) -> Iterator[Section]:
-    import pandas as pd
-
     if study.success:
         yield Section(sentences=[f"Counted: {study.success}."])
     if study.methods:
-        yield Section(frame=pd.DataFrame(study.methods.items(), columns=["method", "what it does"]))
+        yield Section(table=Table.of_lines(["method", "what it does"], study.methods.items()))
     rows = [(name, f"configs/{config}") for name, config in study.configs.items()]
-    yield Section(frame=pd.DataFrame(rows, columns=["experiment", "specification"]))
+    yield Section(table=Table.of_lines(["experiment", "specification"], rows))
 
 
 def _figures(study: Study, out: Path, published: Path, *, own: bool) -> Iterator[Section]:

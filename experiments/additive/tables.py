@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.document import Section, Table
 from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import last_part
@@ -48,19 +48,21 @@ def tables(found: StudyResults) -> list[Section]:
         if name not in found:
             continue
         results = found[name]
-        parts += [Section(title), Section(frame=convergence_table(results))]
+        parts += [Section(title), Section(table=Table.of_frame(convergence_table(results)))]
         if name in ("open-loop", "closed-loop"):
             said = "N times the mean-square error; in brackets its ratio to theory."
-            parts.append(Section("", [said], error_table(results)))
+            parts.append(Section("", [said], Table.of_frame(error_table(results))))
             said = "Mean-square error over that of the sum of submodels, ± standard error."
-            parts += [Section("", [said]), *(Section(frame=table) for table in ratio_tables(results))]
+            parts += [Section("", [said]), *(Section(table=Table.of_frame(table)) for table in ratio_tables(results))]
         elif name == "closed-loop-coloured":
             said = "Bias in standard deviations of one estimate; in brackets in standard errors."
-            parts.append(Section("", [said], bias_table(results)))
+            parts.append(Section("", [said], Table.of_frame(bias_table(results))))
         else:
-            parts.append(Section("", ["Estimates and truth over all data sets."], beam_table(results)))
+            parts.append(Section("", ["Estimates and truth over all data sets."], Table.of_frame(beam_table(results))))
     covering = [found[name] for name in COVERING if name in found]
-    return [*parts, Section("Coverage of 95 % intervals [%]", frame=coverage_table(covering))] if covering else parts
+    if covering:
+        parts.append(Section("Coverage of 95 % intervals [%]", table=Table.of_frame(coverage_table(covering))))
+    return parts
 
 
 def some(sizes: Iterable[int]) -> list[int]:

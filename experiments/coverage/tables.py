@@ -8,7 +8,7 @@ import pandas as pd
 
 from ctid_cli.inference import monte_carlo
 from ctid_cli.inference.monte_carlo import Sample
-from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.document import Section, Table
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import last_part
 from ctid_cli.running.plan import build_plan
@@ -90,4 +90,4 @@ def tables(found: StudyResults) -> list[Section]:
     shown["95 % interval"] = lines["low"].map("{:.1f} to ".format) + lines["high"].map("{:.1f}".format)
     shown["standard error / deviation"] = lines["standard_error_ratio"].map("{:.3f}".format)
     shown["bias / Monte Carlo error"] = lines["bias_in_monte_carlo_errors"].map("{:+.1f}".format)
-    return [Section(frame=shown)]
+    return [Section(table=Table.of_frame(shown))]

@@ -5,7 +5,7 @@ from functools import partial
 
 import pandas as pd
 
-from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.document import Section, Table
 from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import StudyResults
@@ -39,7 +39,7 @@ def tables(found: StudyResults) -> list[Section]:
             parts += [Section(title), *paper_tables(found[name])]
     beyond = {"recovery": recovery_table, "recovery-in-noise": noisy_recovery_table, "efficiency": efficiency_table}
     parts += [write(found[name]) for name, write in beyond.items() if name in found]
-    return [*parts, Section("The formulas as they are printed", frame=as_printed.table())]
+    return [*parts, Section("The formulas as they are printed", table=Table.of_frame(as_printed.table()))]
 
 
 def named(estimator: str) -> str:
@@ -84,7 +84,7 @@ def paper_tables(results: Results) -> list[Section]:
         wrong = of_reading.drop_duplicates("estimator").set_index("estimator")["valid_but_off_by_0.05"]
         table = within.reindex(table.index).join(table).assign(**{"valid [%]": first, "valid, off by 0.05 [s]": wrong})
         table = table.rename(index=named).reset_index()
-        written.append(Section(sentences=[after.get(reading, "") + explained], frame=table, formats=FORMATS))
+        written.append(Section("", [after.get(reading, "") + explained], Table.of_frame(table, FORMATS)))
     return written
 
 
@@ -94,7 +94,7 @@ def recovery_table(results: Results) -> Section:
     rows["median"] = times(rows["median"], 3)
     table = across(rows, "reading", READINGS, ["median"], "{0} [s]").rename(index=named).reset_index()
     text = "Time from the step until both errors are below 1e-6, to stay to the end, 60 s after the step."
-    return Section("Beyond the paper: recovery from the step without noise", [text], table)
+    return Section("Beyond the paper: recovery from the step without noise", [text], Table.of_frame(table))
 
 
 def noisy_recovery_table(results: Results) -> Section:
@@ -110,7 +110,7 @@ def noisy_recovery_table(results: Results) -> Section:
     table = across(shown.join(rows[["estimator", "reading", "derived"]]), "reading", READINGS, [*shown], "{0}: {1}")
     table.columns = [name if name.endswith(": median [s]") else name.partition(": ")[2] for name in table]
     table = table.rename(index=named).reset_index()
-    return Section("Beyond the paper: recovery from the step in noise", [text], table, FORMATS)
+    return Section("Beyond the paper: recovery from the step in noise", [text], Table.of_frame(table, FORMATS))
 
 
 def efficiency_table(results: Results) -> Section:
@@ -128,7 +128,9 @@ def efficiency_table(results: Results) -> Section:
     table.columns = [name if name.endswith("bound") else name.partition(": ")[2] for name in table]
     valid = rows.drop_duplicates("estimator").set_index("estimator")["valid_share"]
     table = table.assign(**{"valid [%]": valid}).rename(index=named).reset_index()
-    return Section("Beyond the paper: errors after 20 s of the noise of section VI-B", [text], table, FORMATS)
+    return Section(
+        "Beyond the paper: errors after 20 s of the noise of section VI-B", [text], Table.of_frame(table, FORMATS)
+    )
 
 
 def _pairs(rows: pd.DataFrame, name: str, digits: int, of_error: int) -> pd.Series:

@@ -2,7 +2,7 @@
 
 import pandas as pd
 
-from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.document import Section, Table
 from ctid_cli.reporting.measures import ALWAYS
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.reporting.study import last_part
@@ -71,4 +71,5 @@ def searches_table(found: StudyResults) -> list[Section]:
     shown["search alone"] = rows["search_percent"].map("{:.0f} %".format).where(searched, "")
     shown["switched"] = rows["switched"].map(str).where(searched, "")
     shown["most"] = rows["most_switches"].map(str).where(searched, "")
-    return [Section(sentences=[SEARCHES], frame=shown.assign(time=rows["median_seconds"].map("{:.2g} s".format)))]
+    shown = shown.assign(time=rows["median_seconds"].map("{:.2g} s".format))
+    return [Section("", [SEARCHES], Table.of_frame(shown))]

@@ -4,15 +4,18 @@ import errno
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import typer
 
+import ctid_cli
 from ctid_cli import __version__
 from ctid_cli.cli.main import app
 from ctid_cli.errors import ExitCode
 from ctid_cli.reporting import study_table
 
+EXAMPLE = Path(ctid_cli.__file__).parent / "templates" / "measured-example.csv"
 COMMANDS = typer.main.get_group(app).commands
 
 #: Modules that may be imported before a command needs them: half a second each would be longer than the work.
@@ -52,6 +55,26 @@ def test_version(ctid):
 def test_nothing_slow_is_imported(code, slow):
     check = f"{code}\nimport sys; found = {slow!r} & set(sys.modules); assert not found, found"
     subprocess.run([sys.executable, "-c", check], check=True, capture_output=True, timeout=120)
+
+
+def test_a_fit_prints_before_it_loads_what_draws(tmp_path):
+    """Typer itself imports pydantic, so that only what ctid needs it for is tested."""
+    slow = {"pandas", "matplotlib", "rich", "jinja2", "h5py", "ctid_cli.specification", "ctid_cli.simulation"}
+    slow |= {f"scipy.{name}" for name in ("signal", "stats", "optimize")}
+    arguments = ["fit", str(EXAMPLE), "--poles", "1", "--zeros", "0", "--delay", "0:20"]
+    code = f"""
+import sys
+from ctid_cli.cli.main import app
+from ctid_cli.reporting.figures.style import Drawing
+Drawing.saved = lambda drawing: sys.exit(f"imported: {{ {slow!r} & set(sys.modules) }}")
+app({arguments!r})
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert "std error" in done.stdout
+    assert done.stderr.splitlines()[-1] == "imported: set()"
+    assert [file.name for file in tmp_path.iterdir()] == ["fit.json"]
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from ctid_cli.reporting.document import Section, render_markdown, render_text
+from ctid_cli.reporting.document import Section, Table, render_markdown, render_text
 from ctid_cli.reporting.pages.experiment_page import experiment_page
 from ctid_cli.reporting.pages.page import ROWS, Chapter, inline, sections_of, write_page
 from ctid_cli.reporting.pages.question import formula_of, polynomial
@@ -49,7 +49,7 @@ def test_text_of_others_stays_text(page, results):
 
 def test_long_tables_are_cut_and_say_so():
     frame = pd.DataFrame({"a": range(ROWS + 5)})
-    text = Page(write_page("t", "lead", [Chapter("Tables", [Section(frame=frame)])])).text
+    text = Page(write_page("t", "lead", [Chapter("Tables", [Section(table=Table.of_frame(frame))])])).text
     assert f"The first {ROWS} of {ROWS + 5} rows" in text
     assert f"{ROWS - 1}" in text
     assert f"{ROWS + 1}" not in text
@@ -76,17 +76,17 @@ def test_equations_are_read_from_the_specification():
 
 def test_published_markdown_is_read_back():
     frame = pd.DataFrame({"a | b": ["x", "y"], "n": ["1", "2"]})
-    text = render_markdown([Section("Title", ["Some words."], frame)])
+    text = render_markdown([Section("Title", ["Some words."], Table.of_frame(frame))])
     title, words, table = sections_of(text)
     assert (title.title, words.sentences) == ("Title", ["Some words."])
-    assert table.frame.equals(frame)
+    assert table.table.to_frame().equals(frame)
 
 
 def test_a_table_that_is_too_wide_goes_on_below_with_what_tells_its_rows_apart():
     frame = pd.DataFrame(
         {"SNR": ["5 dB", "", "15 dB"], "start": ["3 s", "7 s", "3 s"], "%": [1, 2, 3], "time": [4, 5, 6]}
     )
-    assert render_text([Section(frame=frame)], 17).splitlines() == [
+    assert render_text([Section(table=Table.of_frame(frame))], 17).splitlines() == [
         *("  SNR  start  %", "---------------", " 5 dB    3 s  1", "         7 s  2", "15 dB    3 s  3", ""),
         *("  SNR  start  time", "------------------", " 5 dB    3 s     4", "         7 s     5", "15 dB    3 s     6"),
     ]

@@ -10,7 +10,7 @@ import pytest
 
 from ctid_cli.canonical import plain
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.reporting.column_file import frame_bytes, hdf5_bytes
+from ctid_cli.reporting.column_file import csv_bytes, hdf5_bytes
 from ctid_cli.reporting.track_result import TrackResult
 from ctid_cli.signals.sampled_signal import SampledSignal
 from ctid_cli.tones.track import Track
@@ -47,8 +47,8 @@ def test_an_amplitude_that_falls_is_said_to(chosen):
 
 
 def test_csv_and_hdf5_hold_the_same(chosen):
-    table = TrackResult(make_track(some_invalid()), chosen).to_frame()
-    frame = pd.read_csv(io.BytesIO(frame_bytes(table)), keep_default_na=True)
+    table = TrackResult(make_track(some_invalid()), chosen).main_table()
+    frame = pd.read_csv(io.BytesIO(csv_bytes(table)), keep_default_na=True)
     assert list(frame.columns) == [
         "t",
         *("frequency_1_hz", "frequency_error_1_hz", "omega_1", "amplitude_1", "amplitude_error_1"),

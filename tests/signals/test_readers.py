@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
+from ctid_cli.signals import text_file
 from ctid_cli.signals.measurement import read_held_signal, read_measurement, read_record
 
 #: Content of most files below.
@@ -147,6 +148,27 @@ def test_written_numbers_come_back_exactly(tmp_path_factory, rows):
     record = read_record(path)
     assert np.array_equal(record.input.values, [u for u, _ in rows])
     assert np.array_equal(record.y, [y for _, y in rows], equal_nan=True)
+
+
+@given(
+    st.lists(st.floats(-1e9, 1e9), min_size=6, max_size=12),
+    st.sampled_from(["{!r}", "{:.18e}", "{:.25f}", "{:+.3g}", "{:.0f}."]),
+    st.sampled_from([",", ";", "\t", "  "]),
+)
+def test_a_small_file_is_read_like_a_large_one(tmp_path_factory, values, form, separator):
+    rows = list(zip(values[::2], values[1::2], strict=False))
+    lines = [separator.join(["t", "u", "y"])]
+    lines += [separator.join([f"{k}", form.format(u), form.format(y)]) for k, (u, y) in enumerate(rows)]
+    path = tmp_path_factory.mktemp("small") / "record.csv"
+    path.write_text("\n".join(lines))
+    table = text_file.read_text_table(path)
+    small = table.read(("t", "u", "y"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(text_file, "_plain_numbers", lambda *_: None)
+        large = table.read(("t", "u", "y"))
+    for name, column in small.values.items():
+        assert column.tobytes() == large.values[name].tobytes()
+        assert column.strides == large.values[name].strides
 
 
 def test_offsets_are_removed_only_when_asked(write):

@@ -11,10 +11,11 @@ from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.running.plan import build_plan
 from ctid_cli.signals.excitation import Gaussian
+from ctid_cli.signals.files import file_sha256
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.noise import ArmaNoise, WhiteNoise, stream
 from ctid_cli.signals.sampling import RegularSampling, UniformIntervals
-from ctid_cli.simulation.dataset import LoopOptions, MeasuredSource, SimulatedSource, file_sha256
+from ctid_cli.simulation.dataset import LoopOptions, MeasuredSource, SimulatedSource
 from ctid_cli.specification.load import load_spec
 
 MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from functools import cache
-from threading import Thread
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -59,18 +57,6 @@ Format = Literal["svg", "png", "pdf"]
 _METADATA: dict[Format, Any] = {"svg": {"Date": None}, "png": {"Software": None}, "pdf": {"CreationDate": None}}
 
 
-def load_matplotlib() -> None:
-    """Start to import Matplotlib, while compiled kernels continue."""
-    Thread(target=_import_matplotlib).start()
-
-
-def _import_matplotlib() -> None:
-    # The caller reports a failed import.
-    with suppress(ImportError):
-        import matplotlib.backends.backend_svg
-        import matplotlib.figure  # noqa: F401
-
-
 class Drawing(NamedTuple):
     """A figure to draw."""
 
@@ -88,19 +74,18 @@ class Drawing(NamedTuple):
     @reported("drawing the figure")
     def saved(self, style: Format = "svg") -> bytes:
         """Draw the figure as a file; the same drawing always gives the same bytes."""
-        file, figure = io.BytesIO(), self.figure()
-        with _style():
-            figure.savefig(file, format=style, metadata=_METADATA[style], dpi=200)
-        return file.getvalue()
+        from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    @reported("drawing the figure")
-    def laid_out_once(self) -> bytes:
-        """Draw as SVG in half the time: the layout is computed once, and may differ slightly from ``saved``."""
         file, figure = io.BytesIO(), self.figure()
         with _style():
-            figure.draw_without_rendering()
-            figure.set_layout_engine("none")
-            figure.savefig(file, format="svg", metadata=_METADATA["svg"])
+            if style == "svg":
+                # Matplotlib would draw all parts, invisibly, only to lay them out, and then once more.
+                FigureCanvasSVG(figure)
+                layout = figure.get_layout_engine()
+                assert layout is not None
+                layout.execute(figure)
+                figure.set_layout_engine("none")
+            figure.savefig(file, format=style, metadata=_METADATA[style], dpi=200)
         return file.getvalue()
 
 

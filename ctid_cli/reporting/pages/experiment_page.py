@@ -5,19 +5,17 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 import ctid_cli
 from ctid_cli.errors import UsageError
 from ctid_cli.progress import reported
-from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.document import Section, Table
 from ctid_cli.reporting.figures.experiment_plot import experiment_drawing, kinds_of, main_measure
 from ctid_cli.reporting.measures import SUCCESSES, default_measures
 from ctid_cli.reporting.pages.page import Chapter, write_page
 from ctid_cli.reporting.pages.question import formula_of, references
 from ctid_cli.reporting.paired_result import compare_estimators
 from ctid_cli.reporting.results import Results, out_option
-from ctid_cli.reporting.status_result import outcome_frame
+from ctid_cli.reporting.status_result import outcomes_of
 from ctid_cli.reporting.surprises import surprises
 from ctid_cli.reporting.table_result import experiment_table, measure_table, notes_of, success_sentence
 from ctid_cli.storage.sqlite_file import SPEC
@@ -119,12 +117,12 @@ def _comparisons(results: Results, out: Path) -> Iterator[Section]:
 def _outcomes(results: Results, out: Path) -> list[Section]:
     """Return the outcomes of unsuccessful estimates, with the command that shows one of them."""
     notes = [f"Note: {note}" for note in notes_of(results, out)]
-    outcomes = outcome_frame(results.stored)
-    listed = outcomes[~outcomes["status"].isin(SUCCESSES)].head(FAILURES_LISTED)
-    if listed.empty:
+    listed = [each for each in outcomes_of(results.stored) if each["status"] not in SUCCESSES][:FAILURES_LISTED]
+    if not listed:
         return [Section(sentences=["Nothing: every estimate ended as it should."], notes=notes)]
-    commands = [f"`ctid export {results.experiment} --id {id}{out_option(out)}`" for id in listed["first"]]
-    return [Section(frame=listed.assign(first=commands).rename(columns={"first": "the first of them"}), notes=notes)]
+    for each in listed:
+        each["the first of them"] = f"`ctid export {results.experiment} --id {each.pop('first')}{out_option(out)}`"
+    return [Section(table=Table.of_rows(listed), notes=notes)]
 
 
 def _provenance(results: Results, sessions: list[dict[str, Any]]) -> Iterator[Section]:
@@ -133,7 +131,7 @@ def _provenance(results: Results, sessions: list[dict[str, Any]]) -> Iterator[Se
     of_seed = "" if seed is None else f", seed {seed}"
     made = f"Specification {results.manifest['spec_hash'][:16]}{of_seed}; page by ctid {ctid_cli.__version__}."
     origins = [(each.code_version, each.platform, _versions(dict(each.packages))) for each in results.stored.origins]
-    yield Section(sentences=[made], frame=pd.DataFrame(origins, columns=["code version", "platform", "libraries"]))
+    yield Section("", [made], Table.of_lines(["code version", "platform", "libraries"], origins))
     if sessions:
         titles = {
             "started": "session",
@@ -142,9 +140,12 @@ def _provenance(results: Results, sessions: list[dict[str, Any]]) -> Iterator[Se
             "failed": "failed",
             "jobs": "workers",
         }
-        shown = pd.DataFrame(sessions).reindex(columns=[*titles]).rename(columns=titles)
-        shown["Python and libraries"] = [_versions(each.get("packages") or {}) for each in sessions]
-        yield Section(frame=shown)
+        rows = [
+            {title: each.get(key) for key, title in titles.items()}
+            | {"Python and libraries": _versions(each.get("packages") or {})}
+            for each in sessions
+        ]
+        yield Section(table=Table.of_rows(rows))
 
 
 def _versions(packages: Mapping[str, str]) -> str:

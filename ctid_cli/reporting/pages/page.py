@@ -11,7 +11,7 @@ from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import ctid_cli
-from ctid_cli.reporting.document import Result, Section, aligned_lines, pairs
+from ctid_cli.reporting.document import Result, Section, Table, aligned_lines
 from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.layout import html_paragraphs, html_table
 
@@ -61,16 +61,16 @@ def _paragraphs(sentences: Sequence[str], style: str = "") -> Markup:
     return Markup(html_paragraphs(sentences, style))
 
 
-def _table(section: Section) -> Markup:
+def _table(table: Table) -> Markup:
     """Return the first rows of a table."""
     from markupsafe import Markup
 
-    lines, sides = aligned_lines(section)
+    lines, sides = aligned_lines(table)
     return Markup(html_table(lines[: ROWS + 1], sides))
 
 
 def _drawn(drawing: Drawing | bytes, name: str) -> Markup:
-    return inline(drawing if isinstance(drawing, bytes) else drawing.laid_out_once(), name)
+    return inline(drawing if isinstance(drawing, bytes) else drawing.saved(), name)
 
 
 def inline(svg: bytes, name: str) -> Markup:
@@ -155,19 +155,17 @@ def _provenance(stored: Mapping[str, Any]) -> list[Section]:
     rows.append(("checksum of the file", str(stored.get("checksum", ""))))
     command = shown_command(stored["command"]) + "\n"
     again = ["Command, to be run in the same folder:", command] if stored["command"] else []
-    return [Section(frame=pairs(rows)), Section(sentences=again)]
+    return [Section(table=Table.of_pairs(rows)), Section(sentences=again)]
 
 
 def sections_of(markdown: str) -> list[Section]:
     """Read published Markdown: headings, paragraphs and tables."""
-    import pandas as pd
-
     found: list[Section] = []
     for part in filter(None, re.split(r"\n\s*\n", markdown.strip())):
         lines = part.splitlines()
         if lines[0].startswith("|") and len(lines) > 1:
             header, _, *rows = ([cell.strip() for cell in _cells(line)] for line in lines)
-            found.append(Section(frame=pd.DataFrame(rows, columns=header)))
+            found.append(Section(table=Table.of_lines(header, rows)))
         elif lines[0].startswith("#"):
             found.append(Section(lines[0].lstrip("# "), [" ".join(lines[1:])] if lines[1:] else []))
         else:
