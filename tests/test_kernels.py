@@ -174,7 +174,7 @@ def replaced(file, old, new, *, same_stamp=False):
     ("place", "changes"),
     [
         ("edited in place", [CALLEE]),
-        ("upgraded by an installer", [CONSTANT]),
+        pytest.param("upgraded by an installer", [CONSTANT], marks=pytest.mark.slow),
         pytest.param("read-only", [CALLEE, CONSTANT], marks=pytest.mark.slow),
     ],
 )

@@ -115,7 +115,9 @@ def used(tmp_path_factory, ctid):
         write("tones.csv", tones(), "t,y")
         ctid("run --quiet", *(f"{name}.yaml" for name in SPECIFICATIONS))
         for poles in (1, 2):
-            ctid(f"fit record.csv --poles {poles} --delay 0:3 --offset estimate --out p{poles}")
+            ctid(
+                f"fit record.csv --poles {poles} --zeros 0 --integrators 0 --delay 0:3 --offset estimate --out p{poles}"
+            )
         ctid("track tones.csv --tones 2 --out track")
     return folder
 

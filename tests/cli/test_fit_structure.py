@@ -59,6 +59,7 @@ def test_a_sum_of_submodels_is_printed_written_and_read_back(ctid, tmp_path):
     assert again.validation.applied.residuals[0].size == 800
 
 
+@pytest.mark.slow
 def test_a_loop_removes_the_bias_that_coloured_noise_makes(ctid, closed, tmp_path):
     options = (closed, "--input", "u", "--poles", 1, "--out", tmp_path)
     content = fitted(ctid, *options, "--loop", tmp_path / "loop.yaml", "--reference", "r")

@@ -80,6 +80,7 @@ def test_a_coefficient_at_its_bound_is_one_that_is_fixed_there():
     assert (bounded.known, fixed.known) == ((), ("a1",))
 
 
+@pytest.mark.slow
 def test_a_parameter_at_its_bound_is_reported():
     found = identify(record_of(2), DelayProfile(2, 0, (0.0, 0.0), bounds=(Bound("a1", 1.0, 2.0),)))
     assert {item.name: item.status for item in found.estimates}["a1"] == "at bound"

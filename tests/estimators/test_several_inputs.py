@@ -37,6 +37,7 @@ def test_a_second_numerator_fixed_at_zero_leaves_the_fit_of_the_first_input():
     assert part.delay == pytest.approx(one.model.delay, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_equal_denominators_are_a_common_one():
     record = record_of(FIRST, TransferFunction([-1.5], [1.0, 0.6], 1.0), noise=0.2)
     known = tuple(InputModel(name, delay_bounds=(tau, tau)) for name, tau in (("u1", 0.7), ("u2", 1.0)))

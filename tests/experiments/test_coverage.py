@@ -34,6 +34,7 @@ def chosen(summary, row, formula):
     return lines
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("row", "formula"), [("c", "white"), ("d", "sandwich, t")])
 def test_intervals_cover_within_the_binomial_band(summary, row, formula):
     lines = chosen(summary, row, formula)
@@ -44,11 +45,13 @@ def test_intervals_cover_within_the_binomial_band(summary, row, formula):
     assert lines["standard_error_ratio"].between(0.7, 1.4).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("row", "formula"), [("c", "white"), ("d", "sandwich, t")])
 def test_estimates_are_unbiased(summary, row, formula):
     assert (chosen(summary, row, formula)["bias_in_monte_carlo_errors"].abs() < 4).all()
 
 
+@pytest.mark.slow
 def test_the_white_formula_fails_under_coloured_noise(summary):
     wrong, right = chosen(summary, "d", "white"), chosen(summary, "d", "sandwich, t")
     assert (wrong.loc[["a1", "b0"], "percent"] < 75).all()
@@ -56,6 +59,7 @@ def test_the_white_formula_fails_under_coloured_noise(summary):
     assert (wrong["covered"] < right["covered"]).all()
 
 
+@pytest.mark.slow
 def test_only_the_formula_meant_for_a_row_is_judged(found):
     judged = [claim.claim for name in found.experiments for claim in claims.intervals_cover(found[name])]
     assert judged == [

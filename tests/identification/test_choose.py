@@ -82,7 +82,8 @@ def test_state_and_offset_are_those_that_were_made(made, state, offset):
 
 
 def test_outliers_are_left_out_of_the_choice_and_given_another_loss():
-    record, given = record_of(SECOND), replace(ONE, delay_bounds=(0.0, 1.0))
+    record = record_of(SECOND)
+    given = replace(ONE, delay_bounds=(0.0, 1.0), initial_state="rest", offset="none")
     y, clean = record.y.copy(), choice_of(SECOND, given)
     y[[30, 90, 250]] += (30.0, -40.0, 25.0)
     choice = choose(replace(record, y=y), given)

@@ -57,7 +57,7 @@ def two_inputs(delay=0.0, seed=0, n=600):
     return Record(t, x + NOISE * rng.standard_normal(n), {"u1": u1, "u2": u2})
 
 
-def looped(gain=0.8, n=1000):
+def looped(gain=0.8, n=600):
     """Return a record in the loop of a proportional controller."""
     rng = np.random.default_rng(5)
     r = np.repeat(rng.choice([-1.0, 1.0], n // 5), 5)
@@ -81,7 +81,7 @@ REMEDIED = {
         KNOWN,
         "with --poles 4 --zeros",
     ),
-    "an integrator": (record_of(INTEGRATING), KNOWN, "with --integrators 1 the held-back fit is"),
+    "an integrator": (record_of(INTEGRATING, n=600), KNOWN, "with --integrators 1 the held-back fit is"),
     "a delay that is not searched": (record_of(LATE), KNOWN, "The delay is taken as 0 s: with --delay 0:20 "),
     "a delay outside the range": (
         record_of(LATE),

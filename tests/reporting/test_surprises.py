@@ -57,6 +57,7 @@ def biased(errors, deviations):
     return errors + [0.0, 0.0, 2.0] * deviations
 
 
+@pytest.mark.slow
 def test_there_is_no_sentence_about_what_is_as_expected(results):
     # At a level of 5 %, three or more of twenty have a probability of 8 %.
     assert sum(bool(surprises(results(seed=seed))) for seed in range(20)) <= 2

@@ -125,6 +125,7 @@ def asked(*classes):
     return "measures=[bias, " + ", ".join(f'{{kind: "./parts.py:{name}"}}' for name in classes) + "]"
 
 
+@pytest.mark.slow
 def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(file, tmp_path, capfd):
     plan, out = planned(file), tmp_path / "out"
     summary = run(plan, out)

@@ -91,7 +91,15 @@ def test_a_tone_that_moves_is_followed(hertz):
 
 
 @pytest.mark.parametrize("tones", [1, None])
-@pytest.mark.parametrize(("deviation", "rate"), [(2.5, 0.5), (5.0, 1.0), (2.5, 2.0), (20.0, 0.5)])
+@pytest.mark.parametrize(
+    ("deviation", "rate"),
+    [
+        (2.5, 0.5),
+        pytest.param(5.0, 1.0, marks=pytest.mark.slow),
+        (2.5, 2.0),
+        pytest.param(20.0, 0.5, marks=pytest.mark.slow),
+    ],
+)
 def test_a_tone_whose_frequency_swings_is_not_the_lines_that_it_makes(deviation, rate, tones):
     """At 2.5 Hz and .5 Hz, 13 lines exceed a tenth of the tone; at 20 Hz, more lines than a window resolves."""
     t = INTERVAL * np.arange(10_000)
