@@ -28,7 +28,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-com
 COMPILE := $(BIN)/python -m compileall -q -j 0
 BYTECODE := $(COMPILE) -x '/tests?/' $(VENV)/lib ctid_cli
 # One thread each: the threads of two workers wait for each other.
-PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --dist loadfile --no-loadscope-reorder --durations 5
+PYTEST := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --dist loadfile --no-loadscope-reorder --durations 5
 
 .PHONY: demo test test-slow types kernels pytest reproduce reproduce-small docs scoreboard release-check bench clean
 .DELETE_ON_ERROR:

@@ -78,6 +78,7 @@ def test_permission(command, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_whole_study_shows_its_files_and_they_run(tmp_path):
     page = (EXAMPLES.parent / "custom-components.md").read_text(encoding="utf-8")
     for language, name in (("py", "projection.py"), ("yaml", "projection.yaml")):

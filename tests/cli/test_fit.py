@@ -75,6 +75,7 @@ def test_a_noise_model_is_printed_written_and_read_back(ctid, tmp_path):
     assert np.isfinite(again.predict(record, 5)).all()
 
 
+@pytest.mark.slow
 def test_several_files_and_a_validation_record(ctid, record, tmp_path):
     second = write(tmp_path / "second.csv", rows(seed=1))
     third = write(tmp_path / "third.csv", rows(seed=2))

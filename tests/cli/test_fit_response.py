@@ -36,6 +36,7 @@ def test_a_frequency_response_is_fitted_drawn_and_reported(ctid, tmp_path, snaps
     assert pages[0] == pages[1]
 
 
+@pytest.mark.slow
 def test_a_sum_of_one_submodel_is_the_transfer_function(ctid, tmp_path):
     file, found = response_file(tmp_path), []
     for options in ("--poles 1", "--model additive --terms 1/0 --report"):

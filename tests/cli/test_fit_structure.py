@@ -78,6 +78,7 @@ def test_a_loop_removes_the_bias_that_coloured_noise_makes(ctid, closed, tmp_pat
     assert "estimate is biased" in ignored["covariance"]["reason"]
 
 
+@pytest.mark.slow
 def test_a_loop_whose_controller_is_not_known(ctid, closed, tmp_path):
     options = (closed, "--input", "u", "--poles", 1, "--out", tmp_path)
     content = fitted(ctid, *options, "--reference", "r")

@@ -11,6 +11,7 @@ from ctid_cli.cli.main import app
 from ctid_cli.running.trial import load_tried
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_workers")
 def test_the_templates_are_valid_and_run(ctid, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -72,7 +72,9 @@ def test_an_experiment_that_fails_wholly_does_not_stop_the_next_one(ctid, here, 
     assert done.stdout + done.stderr == snapshot
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
+)
 def test_a_stopped_run_can_be_resumed(ctid, here, number, code):
     process = start(here, "run tiny.yaml --runs 5000 --jobs 1")
     assert any("30000 estimates of 10000 data sets to compute" in line for line in process.stderr)

@@ -115,6 +115,7 @@ def test_the_noise_model_is_chosen_and_increases_the_accuracy():
     assert condition_number(np.linalg.inv(found.uncertainty.covariance)) < 1e6
 
 
+@pytest.mark.slow
 def test_a_larger_plant_is_no_less_likely():
     """A record for which a further zero moves the minimum output error to a basin caused by the noise."""
     record, options = record_of(seed=4, n=150, offset=1.0), {"offset": "estimate", "noise_model": "arma:2,1"}

@@ -90,7 +90,7 @@ def test_gradients_of_the_projected_cost_are_exact(name, repeated):
     np.testing.assert_allclose(found, numeric, rtol=1e-5, atol=1e-6 * np.abs(found).max())
 
 
-@pytest.mark.parametrize("name", ["common", "integrating"])
+@pytest.mark.parametrize("name", ["common", pytest.param("integrating", marks=pytest.mark.slow)])
 def test_sensitivities_are_the_derivatives_of_the_output(name):
     measured = PROBLEMS[name].prepare(record_of(FIRST, SECOND)).laid_out
     model = measured.model(measured.best((), True))

@@ -73,6 +73,7 @@ def test_settling_times_are_those_of_a_direct_simulation(study):
     assert not {"esprit", "nonlinear_least_squares"} & set(rows["estimator"])
 
 
+@pytest.mark.slow
 def test_a_step_is_measured_piece_by_piece_and_what_is_valid_but_wrong_is_found(study):
     rows = measured.settling(study["step"])
     assert set(rows["piece"]) == {"from 0 s", "from 30 s"}
@@ -179,6 +180,7 @@ def published(study):
     return texts
 
 
+@pytest.mark.slow
 def test_everything_is_written(published):
     assert list(published) == ["tables.md", "settling.csv", "residuals.csv", "recovery.csv", "efficiency.csv"]
     rows = list(csv.DictReader(published["recovery.csv"].splitlines()))

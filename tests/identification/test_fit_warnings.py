@@ -109,7 +109,7 @@ OBSERVED = {
 
 
 #: Several inputs with several structures to try.
-LONG = ("a delay of the second input", "one pole too few for the first input")
+LONG = ("a delay of the second input", "one pole too few for the first input", "one pole too few, two inputs")
 
 
 @pytest.mark.parametrize("fault", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in REMEDIED])
@@ -157,6 +157,7 @@ def test_a_low_fit_says_what_was_tried_without_gain():
     assert "tried without gain: other values of --poles, --zeros, " in low
 
 
+@pytest.mark.slow
 def test_another_remedy_is_named_in_addition_to_the_first():
     record = changed(CLEAN, CLEAN.y + 0.6)
     found = tried_remedies([record], FIRST_ORDER, FIRST_ORDER.fit([record])).remedies
@@ -190,6 +191,7 @@ def test_several_records_say_which_one():
     assert warnings[0].startswith("1 output sample is an outlier (t = 100 s of experiment 2)")
 
 
+@pytest.mark.slow
 def test_a_long_record_is_tried_on_its_beginning():
     record = record_of(n=12_000)
     (remedy,) = tried_remedies([record], FIRST_ORDER, FIRST_ORDER.fit([record])).remedies

@@ -37,6 +37,7 @@ def messages(place: Path) -> set[str]:
     return set(frame["message"][frame["status"] != "CONVERGED"])
 
 
+@pytest.mark.slow
 def test_what_takes_too_long_is_ended_and_all_else_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "GRACE", 0.2)
     stop = Toy("stop", at=0, order=6)

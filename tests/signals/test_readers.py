@@ -133,6 +133,7 @@ def test_each_refusal_says_where_and_what_to_do(write, kind):
     assert str(error.value) == f"{path}{message}"
 
 
+@pytest.mark.slow
 def test_a_word_and_a_field_too_many_are_found_far_down(write):
     rows = [f"{k},1,{k}" for k in range(200_000)]
     for row, message in (("190000,1,off", "column 'y' holds 'off'"), ("190000,1,2,5", "the line has 4 fields")):
