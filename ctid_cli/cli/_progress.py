@@ -141,7 +141,7 @@ class Watch:
         self._thread.start()
         self._stack.callback(self._stop)
         # A process in the background of a script ignores SIGINT.
-        if self.owns_process and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        if self.owns_process and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
             self._stack.callback(signal.set_wakeup_fd, signal.set_wakeup_fd(self._woken, warn_on_full_buffer=False))
             self._stack.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, self._interrupt))
         return self
