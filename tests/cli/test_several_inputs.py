@@ -22,6 +22,7 @@ def record(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_model_is_fitted_written_compared_and_exported(ctid, record, tmp_path):
     options = ("--poles", "u1=2", "--poles", "u2=1", "--delay", 0, "--fix", "u1_delay=0.7")
     options += ("--initial-state", "rest", "--offset", "none", "--hold", "u1=zoh", "--hold", "u2=foh")

@@ -75,6 +75,7 @@ def test_the_size_of_an_outlier_does_not_matter(loss):
         assert set(record.t[[2, 90, 91, 200]]) <= set(record.t[use][out])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("loss", "contamination"),
     [

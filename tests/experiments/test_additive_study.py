@@ -82,6 +82,7 @@ def changed(study):
     return claims_of
 
 
+@pytest.mark.slow
 def test_a_study_as_theory_expects_is_accepted(study):
     found = check_claims(study)
     assert failures(found.claims) == []
@@ -144,6 +145,7 @@ def test_what_was_not_run_does_not_hold(study):
     assert failures(check_claims(only).claims) == ["was run"] * 5
 
 
+@pytest.mark.slow
 def test_what_is_published(study):
     texts = published_texts(study)
     assert list(texts) == ["tables.md", "errors.csv", "ratios.csv", "coverage.csv", "unfinished.csv"]

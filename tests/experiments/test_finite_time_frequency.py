@@ -94,6 +94,7 @@ def test_a_step_is_measured_piece_by_piece_and_what_is_valid_but_wrong_is_found(
     assert row["valid_but_off_by_0.05"] == pytest.approx(0.01 * wrong.sum())
 
 
+@pytest.mark.slow
 def test_medians_over_data_sets(study):
     errors = measured.residuals(study["random"])
     row = one(errors, estimator="finite_time", tone=2)
@@ -105,6 +106,7 @@ def test_medians_over_data_sets(study):
     assert times["within_0.05"] <= times["longest_0.05"] < 6
 
 
+@pytest.mark.slow
 def test_recovery(study):
     rows = measured.recovery(study["recovery"])
     assert one(rows, estimator="window", reading="jump")["longest"] == pytest.approx(7.595, abs=0.01)
@@ -117,6 +119,7 @@ def test_recovery(study):
     assert alarmed["band"] == 0.02
 
 
+@pytest.mark.slow
 def test_efficiency_is_the_error_of_the_last_estimate_over_the_bound(study):
     row = one(measured.efficiency(study["efficiency"]), estimator="esprit", tone=1)
     last = np.array([r["measures"]["omega_1"] for r in study["efficiency"].stored if r["estimator"] == "esprit"])
@@ -134,6 +137,7 @@ def test_the_monte_carlo_error_is_that_of_normal_errors():
     assert measured.monte_carlo_error(100 + rng.standard_normal(10_000)) == pytest.approx(0.01, rel=0.05)
 
 
+@pytest.mark.slow
 def test_claims_are_judged_on_stored_runs(study, monkeypatch):
     checks = check_claims(study).claims
     by_experiment = {name: [c for c in checks if c.experiment == name] for name in study.experiments}
@@ -151,6 +155,7 @@ def test_claims_are_judged_on_stored_runs(study, monkeypatch):
     assert [claim.measured for claim in missed] == ["inf", "inf"]
 
 
+@pytest.mark.slow
 def test_the_grey_band_of_a_figure_ends_where_finite_time_is_exact(out, drawn):
     for number, end in (("1", 0.66), ("2", 4.74), ("3", 3.2), ("4", 3.6)):
         (item,) = find_figures([f"finite-time-frequency/{number}"])
@@ -188,6 +193,7 @@ def test_everything_is_written(published):
     assert len(rows) == 2 * (8 + 11)
 
 
+@pytest.mark.slow
 def test_tables_say_what_is_derived_and_what_is_biased(published):
     text = published["tables.md"]
     lines = [line for line in text.splitlines() if line.startswith(("| `observer`", "| `filter"))]
@@ -200,6 +206,7 @@ def test_tables_say_what_is_derived_and_what_is_biased(published):
     assert "| `finite_time` | 0.66 | 0.66 | 0.66 |" in text
 
 
+@pytest.mark.slow
 def test_misprints(monkeypatch):
     monkeypatch.setattr(as_printed, "INTERVAL", 0.01)
     rows = {(what, where): (printed, corrected) for what, where, printed, corrected in as_printed.rows()}

@@ -81,6 +81,7 @@ def test_state_and_offset_are_those_that_were_made(made, state, offset):
     assert (options.initial_state, options.offset) == (state, offset)
 
 
+@pytest.mark.slow
 def test_outliers_are_left_out_of_the_choice_and_given_another_loss():
     record = record_of(SECOND)
     given = replace(ONE, delay_bounds=(0.0, 1.0), initial_state="rest", offset="none")

@@ -124,6 +124,7 @@ def test_excitation_counts_two_for_every_tone(tones):
     assert excitation_order(*sampled_input(record), moves, analyse_response(record, moves)) == 2 * tones
 
 
+@pytest.mark.slow
 def test_gaps_and_periods():
     t = 0.1 * np.arange(600)
     u = np.tile(np.random.default_rng(8).choice([-1.0, 1.0], 100), 6)
