@@ -63,7 +63,10 @@ def test_an_estimator_of_frequencies(tmp_path):
     assert all(row["converged"] for row in rows)
 
 
-@pytest.mark.parametrize("command", [("validate",), ("run", "--dry-run"), ("accuracy",)])
+@pytest.mark.parametrize(
+    "command",
+    [("validate",), *(pytest.param(words, marks=pytest.mark.slow) for words in (("run", "--dry-run"), ("accuracy",)))],
+)
 def test_permission(command, tmp_path, monkeypatch):
     file = EXAMPLES / "custom_study.yaml"
     place = () if command[0] != "run" else ("--out", tmp_path)

@@ -236,6 +236,7 @@ def test_no_response_is_no_model():
         identify(noise, Given(zeros=0))
 
 
+@pytest.mark.slow
 def test_a_part_of_a_long_record_is_looked_at():
     choice = choose(record_of(SECOND, count=12_000), FEW)
     assert choice.fitted[0].n_samples == 2500

@@ -108,8 +108,14 @@ OBSERVED = {
 }
 
 
-#: Several inputs with several structures to try.
-LONG = ("a delay of the second input", "one pole too few for the first input", "one pole too few, two inputs")
+#: Several inputs with several structures to try, and treatments that are tried after other remedies.
+LONG = (
+    "a delay of the second input",
+    "one pole too few for the first input",
+    "one pole too few, two inputs",
+    "a drift",
+    "a delay outside the range",
+)
 
 
 @pytest.mark.parametrize("fault", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in REMEDIED])

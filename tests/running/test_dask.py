@@ -78,6 +78,7 @@ def test_an_unreachable_scheduler_is_named(tmp_path: Path) -> None:
     assert not (tmp_path / "toys").exists()
 
 
+@pytest.mark.slow
 def test_data_files_come_by_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content = b"t,u\n0,1\n"
     digest = hashlib.sha256(content).hexdigest()
