@@ -4,6 +4,7 @@ import itertools
 import os
 import re
 import stat
+from collections import deque
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -20,8 +21,8 @@ _DEVICES = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)", re.IGNORECAS
 _SHARD = re.compile(r"\.shard-\d+-of-\d+$")
 _TEMPORARY = ".tmp"
 _numbers = itertools.count(1)
-#: Files that this process has completely written, and those that it is writing.
-written: list[Path] = []
+#: The last files that this process has completely written, and those that it is writing.
+written: deque[Path] = deque(maxlen=100)
 _unfinished: set[Path] = set()
 
 
@@ -44,7 +45,8 @@ def write_file(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:
         temporary.replace(path)
         written.append(path)
     except BaseException:
-        remove_unfinished()
+        # Other threads write other files.
+        _remove(temporary)
         raise
     finally:
         _unfinished.discard(temporary)
@@ -59,8 +61,12 @@ def write_file(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:
 def remove_unfinished() -> None:
     """Remove the files that this process is writing, before it ends."""
     for path in [*_unfinished]:
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
+        _remove(path)
+
+
+def _remove(path: Path) -> None:
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
 
 
 def _write(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:
