@@ -32,7 +32,7 @@ class Whitenable(Protocol):
         """Return a copy with whitened errors."""
 
     def local(self, *starts: Any) -> Any:
-        """Return the minimum in the basin of a start."""
+        """Return the minimum in the basin of a start; None if none is found."""
 
 
 class JointOptimum(NamedTuple):
@@ -88,10 +88,13 @@ def joint_near(measured: Whitenable, found: Any, orders: Orders | None) -> Joint
 
 
 def _settled(measured: Whitenable, joint: JointOptimum) -> JointOptimum:
-    """Estimate plant and noise alternately until the likelihood converges."""
+    """Estimate plant and noise alternately until the likelihood converges, or no plant is found under the noise."""
     (found, noise), steps = joint, [steps_of(use) for use in measured.used()]
     for _ in range(MOST_ROUNDS if sum(noise.orders) else 0):
-        found = measured.whitened_by(noise.noise).local(found.start)
+        moved = measured.whitened_by(noise.noise).local(found.start)
+        if moved is None:
+            break
+        found = moved
         updated = fit_arma(measured.errors(found), steps, noise.orders, noise)
         settled, noise = noise.deviance - updated.deviance < SETTLED, updated
         if settled:

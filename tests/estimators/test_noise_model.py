@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy.linalg import cholesky, solve_triangular, toeplitz
 from scipy.optimize import least_squares
+from scipy.signal import lfilter
 
 from ctid_cli import DelayProfile, HeldSignal, Record, Rivc, TransferFunction, identify, simulate
 from ctid_cli.errors import DataError, OptionError
+from ctid_cli.estimation.noise_search import joint_near
 from ctid_cli.inference.covariance import condition_number
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.sensitivities import sensitivities
@@ -170,3 +172,33 @@ def test_what_a_noise_model_does_not_go_with():
         Rivc(**KNOWN).fit(shifted)
     with pytest.raises(OptionError, match="loss squares, not tukey"):
         DelayProfile(**KNOWN, loss="tukey", noise_model="auto")
+
+
+class Plant(str):
+    """A minimum that is the start of the next search."""
+
+    start = None
+
+
+class Lost:
+    """Records of which no plant is found once their errors are whitened."""
+
+    def used(self):
+        return (np.ones(300, dtype=bool),)
+
+    def errors(self, found):
+        assert found == "the plant"
+        return [lfilter([1.0], [1.0, -0.8], np.random.default_rng(3).standard_normal(300))]
+
+    def whitened_by(self, noise):
+        return self
+
+    def local(self, *starts):
+        return None
+
+
+@pytest.mark.parametrize("orders", [None, (1, 0)])
+def test_a_plant_that_is_not_found_under_the_noise_is_kept(orders):
+    joint = joint_near(Lost(), Plant("the plant"), orders)
+    assert joint.found == "the plant"
+    assert joint.noise.noise.denominator[1] == pytest.approx(-0.8, abs=0.15)
