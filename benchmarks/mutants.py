@@ -15,6 +15,7 @@ The sources are changed in a copy of the checkout, never here. Processor time: s
 
 import argparse
 import ast
+import os
 import random
 import shutil
 import sqlite3
@@ -129,7 +130,10 @@ def drawn(record, part, count, rng):
 def kills(copy, tests, mark):
     """Return whether one of the tests fails, and None if none has the mark."""
     words = ["-x", "-q", "-n", "logical", "--dist", "loadfile", "-p", "no:cacheprovider", "-m", mark, *tests]
-    done = subprocess.run([sys.executable, "-m", "pytest", *words], cwd=copy, capture_output=True, timeout=3600)
+    # Bytecode of an earlier mutant may have the same size and time stamp.
+    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1", "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "pytest", *words]
+    done = subprocess.run(command, cwd=copy, capture_output=True, env=environment, timeout=3600)
     return None if done.returncode == 5 else done.returncode != 0
 
 
