@@ -211,7 +211,7 @@ def sampled_radius(sampled: SampledModel, discrete: DiscreteController) -> float
 
 
 def sampled_poles(sampled: SampledModel, discrete: DiscreteController) -> ComplexArray:
-    """Return the poles of the loop of a sampled model; infinite ones if the response over an interval overflows."""
+    """Return the poles of the loop of a sampled model."""
     _require_sampled_solution(sampled, discrete)
     A, B, C, D = sampled.state_space()
     Ac, Bc, Cc, Dc = discrete.state_space()
@@ -222,8 +222,6 @@ def sampled_poles(sampled: SampledModel, discrete: DiscreteController) -> Comple
     dynamics = np.vstack((B @ u, -Bc @ x))
     dynamics[:n, :n] += A
     dynamics[n:, n:] += Ac
-    if not np.isfinite(dynamics).all():
-        return np.full(len(dynamics), np.inf, dtype=complex)
     return np.asarray(np.linalg.eigvals(dynamics), dtype=complex)
 
 

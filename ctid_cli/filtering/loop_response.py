@@ -90,9 +90,15 @@ class LoopResponse:
         return np.column_stack([unforced.rows(theta, 0, cell, unit).output for unit in np.eye(size)])
 
     def radius(self, theta: Array) -> float:
-        """Return the largest magnitude of the poles of the loop over one sampling interval; it is stable below 1."""
+        """Return the largest magnitude of the poles of the loop over one sampling interval; it is stable below 1.
+
+        It is infinite if the response of the model overflows within the interval.
+        """
         if isinstance(self.controller, DiscreteController):
-            return sampled_radius(self._sampled(theta, None), self.controller)
+            try:
+                return sampled_radius(self._sampled(theta, None), self.controller)
+            except np.linalg.LinAlgError:
+                return np.inf
         interval = self.data.interval or float(np.median(np.diff(self.data.t)))
         return float(np.exp(np.linalg.eigvals(self._whole(theta)[0]).real.max(initial=-np.inf) * interval))
 

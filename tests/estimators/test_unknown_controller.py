@@ -35,6 +35,12 @@ def test_a_controller_that_stabilises_an_unstable_plant(delay):
     assert loop_radius(plant, stabilising_controller(plant, 0.05), 0.05) < 1.0
 
 
+def test_a_plant_whose_response_overflows_is_not_admissible():
+    problem = LoopOutputError(2, 0).prepare(alone(record(UNSTABLE, PD))).laid_out.problem.around(THETA)
+    assert np.isfinite(problem.squared_error(THETA))
+    assert problem.squared_error(np.array([-1e5, 1.0, 1.0, 0.0])) == np.inf
+
+
 def test_a_stable_plant_is_that_of_the_output_error_in_open_loop():
     one = alone(record(STABLE, PI, noise=0.1, count=800))
     options = {"initial_state": "estimate", "offset": "estimate", "covariance": "white"}

@@ -95,11 +95,6 @@ def test_every_signal_satisfies_its_equation(name, enters, delay):
     np.testing.assert_allclose(u, expected, atol=1e-10 * np.abs(u).max())
 
 
-def test_a_loop_whose_response_overflows_has_no_finite_radius():
-    with np.errstate(all="ignore"):
-        assert loop_radius(TransferFunction([1.0], [1.0, -1e4]), DiscreteController([1.0], [1.0]), 1.0) == np.inf
-
-
 def test_what_cannot_be_simulated_is_refused():
     r, v = signals(3000)
     five = DiscreteController(5000 * PID.numerator, PID.denominator)
