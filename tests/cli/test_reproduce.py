@@ -85,6 +85,7 @@ def test_claims_and_tables_are_checked(ctid, profiled, snapshot):
     assert done.stderr == snapshot
 
 
+@pytest.mark.slow
 def test_what_is_published_lists_every_failure(ctid, profiled):
     study = find_study("useful-redundancy")
     texts = publishing.published_texts(read_study(study, profiled))

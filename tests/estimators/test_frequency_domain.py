@@ -170,6 +170,7 @@ def test_an_estimated_response_gives_the_system_although_its_hold_was_divided_ou
     np.testing.assert_allclose(fit.theta, [1.0, 4.0, 2.0, 4.0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_noise_alone_is_no_model():
     rng = np.random.default_rng(5)
     seen = 0

@@ -26,6 +26,7 @@ def record_of(*models: TransferFunction, noise: float = 0.1, seed: int = 0) -> R
     return Record(T, y + noise * rng.standard_normal(T.size), inputs)
 
 
+@pytest.mark.slow
 def test_a_second_numerator_fixed_at_zero_leaves_the_fit_of_the_first_input():
     record = record_of(FIRST, SECOND)
     inputs = (InputModel("u2", zeros=0, delay_bounds=(0.5, 0.5)),)

@@ -76,6 +76,7 @@ def test_nothing_of_the_machine_is_on_the_page(fitted, tmp_path):
     assert str(tmp_path) not in page
 
 
+@pytest.mark.slow
 def test_a_known_delay_and_a_model_of_nothing_have_pages_too(tmp_path):
     rng = np.random.default_rng(3)
     t = 0.1 * np.arange(200)

@@ -149,6 +149,7 @@ def test_failures_of_the_machine_are_reported_and_not_stored(
     assert (again.computed, again.missing, again.exit_code) == (1, 0, 0)
 
 
+@pytest.mark.slow
 def test_without_descriptors_nothing_is_stored_and_the_run_says_what_to_do(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.running.run_toys", str(tmp_path / "toys"), "2", "--runs=1"]
     done = subprocess.run([*command, "--open-files=14"], cwd=ROOT, capture_output=True, text=True)
