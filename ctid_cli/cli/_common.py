@@ -130,6 +130,8 @@ def emit(
     names = list(map(str, written))
     try:
         _print(result, form, names, stored)
+        if Watch.current is not None:
+            Watch.current.printed()
     finally:
         # A reader that closes the pipe, such as head, does not lose the figures.
         draw()

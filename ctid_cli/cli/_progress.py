@@ -78,6 +78,10 @@ class Display:
                 self._put("\r\x1b[K")
                 self._shown, self._due = "", time.monotonic() + SILENT
 
+    def postpone(self) -> None:
+        """Count the time without output from now on."""
+        self._due = time.monotonic() + SILENT
+
     def close(self) -> None:
         """Remove the status line for good."""
         self.clear()
@@ -162,6 +166,10 @@ class Watch:
         # In a callback from C, Python would print the error that it drops.
         sys.unraisablehook = lambda unraisable: None
         raise KeyboardInterrupt
+
+    def printed(self) -> None:
+        """Note that the command has just printed something."""
+        self._display.postpone()
 
     def _stop(self) -> None:
         os.write(self._woken, b"\0")
