@@ -5,7 +5,7 @@ python benchmarks/mutants.py [--seed 1] [--each 10] [--list]
 Ten mutants of each of three parts of the package: estimation, the runner, inference and identification. A mutant
 changes one operator, comparison, constant or condition of a line that is executed by a test. The tests that execute the
 line, as recorded in ``.coverage``, are run with ``-x``: the unmarked ones first, and for the survivors those marked
-slow. Make the record by
+slow. Install pytest-cov, which nothing else needs, and make the record by
 
     .venv/bin/python -m pytest -q -n 2 --dist loadfile -m "" --cov ctid_cli --cov-branch --cov-context=test \
         --cov-report=
