@@ -190,7 +190,7 @@ def test_what_is_given_is_kept():
 
 
 def test_the_choice_typed_out_is_the_same_model():
-    choice = choice_of(SECOND, ONE, offset=3.0)
+    choice = choice_of(SECOND, ONE, offset=3.0, count=600)
     words = dict(zip(choice.words()[::2], choice.words()[1::2], strict=True))
     low, high = map(float, words["--delay"].split(":"))
     typed = Given(
@@ -203,8 +203,8 @@ def test_the_choice_typed_out_is_the_same_model():
         None if words["--input-before"] == "first" else float(words["--input-before"]),
         words["--hold"],
     )
-    again = identify(record_of(SECOND, offset=3.0), typed)
-    np.testing.assert_allclose(again.fit.theta, choice.ranking.best.fit.theta, rtol=1e-6)
+    again = identify(record_of(SECOND, offset=3.0, count=600), typed)
+    np.testing.assert_allclose(again.fit.theta, choice.ranking.best.fit.theta, rtol=1e-9)
 
 
 def test_a_validation_record_has_a_state_and_an_offset_of_its_own():

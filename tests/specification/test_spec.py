@@ -94,7 +94,7 @@ def places(node):
             yield from places(value)
 
 
-@settings(max_examples=10)
+@settings(max_examples=20)
 @given(st.data())
 def test_whatever_is_wrong_ends_in_problems_with_their_places(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("spec")
