@@ -131,7 +131,7 @@ def emit(
     try:
         _print(result, form, names, stored)
         if Watch.current is not None:
-            Watch.current.printed()
+            Watch.current.display.postpone()
     finally:
         # A reader that closes the pipe, such as head, does not lose the figures.
         draw()

@@ -137,8 +137,8 @@ class Watch:
     def __enter__(self) -> Self:
         Watch.current, self._before = self, Watch.current
         written_files.written.clear()
-        self._display = Display(f"ctid {self._command}", self._stack.enter_context(listening()))
-        self._stack.callback(self._display.close)
+        self.display = Display(f"ctid {self._command}", self._stack.enter_context(listening()))
+        self._stack.callback(self.display.close)
         self._wake, self._woken = os.pipe()
         os.set_blocking(self._woken, False)
         self._thread = threading.Thread(target=self._watch, name="ctid-progress", daemon=True)
@@ -167,10 +167,6 @@ class Watch:
         sys.unraisablehook = lambda unraisable: None
         raise KeyboardInterrupt
 
-    def printed(self) -> None:
-        """Note that the command has just printed something."""
-        self._display.postpone()
-
     def _stop(self) -> None:
         os.write(self._woken, b"\0")
         self._thread.join()
@@ -190,13 +186,13 @@ class Watch:
             if time.monotonic() >= self._ends:
                 self._end()
             if not self._quiet and self._ends == float("inf"):
-                self._display.tick(time.monotonic())
+                self.display.tick(time.monotonic())
 
     def _end(self) -> NoReturn:
         """End the process at once: the end of the interpreter may take a second."""
         self._ending.acquire()
         written_files.remove_unfinished()
-        self._display.clear()
+        self.display.clear()
         os.write(2, f"{self._sentence()}\n".encode())
         os._exit(ExitCode.INTERRUPTED)
 
