@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,18 @@ LONG, PART = 100_000, 20_000
 #: Start of a search: a denominator, or the concatenated poles of several denominators; and the delay, or one for each
 #: input [s].
 Begin = tuple[Any, float | tuple[float, ...]]
+
+
+class OtherMinimum(NamedTuple):
+    """Further local minimum of the structure, nearly as low as the least one."""
+
+    #: Poles without integrators [rad/s]; those of several denominators are concatenated.
+    poles: ComplexArray
+    #: Delay of each input [s].
+    delays: tuple[float, ...]
+    squared_error: float
+    #: Start of a search for this minimum.
+    start: Begin
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +83,8 @@ class Optimum:
     integrators: tuple[int, ...] = (0,)
     #: Submodels, if the model is a sum of submodels.
     additive: AdditiveModel | None = None
+    #: Other minima of the structure whose squared error S satisfies ``N (S/S_min - 1) <= 3 * 3.84`` for N samples.
+    others: tuple[OtherMinimum, ...] = ()
 
     @property
     def numerator(self) -> Array:
@@ -151,7 +165,7 @@ def best_output_error(
             there = best_output_error(part, poles, delays, starts, random_starts=random_starts, seed=seed, known=known)
             points, nested = [_point(there.start, box)], False
         search = _with_known(search, poles, points, nested, known)
-        return _least(search, poles, zeros, False)
+        return _with_others(_least(search, poles, zeros, False), search, poles, zeros)
     if part is not None:
         pilot = StructureSearch(part, box_of(part, delays), random_starts, seed)
         found = _from_part(StructureSearch(problem, box, pilot=pilot), pilot, poles, fewer_poles)
@@ -163,7 +177,7 @@ def best_output_error(
     search.refine(poles, zeros, points)
     if nested:
         search.refine(poles, zeros, search.close_delays(poles, zeros))
-        return _least(search, poles, zeros, fewer_poles)
+        return _with_others(_least(search, poles, zeros, fewer_poles), search, poles, zeros)
     found = _least(search, poles, zeros, False)
     if (found.tried > 1 and found.agree == 1) or not found.ending.optimal:
         search.refine(poles, zeros, search.random_points(poles))
@@ -211,16 +225,17 @@ def _met(points: Sequence[Point], box: Box, known: KnownCoefficients) -> list[Po
 
 def _from_part(search: StructureSearch, pilot: StructureSearch, poles: int, fewer_poles: bool) -> Optimum | None:
     """Return the optimum found from a part of the records; None if it does not fit the whole records."""
-    problem, found = search.problem, []
+    problem, ends = search.problem, list[Optimum]()
     for one in (pilot, search):
         one.climb(poles, problem.zeros)
-        found.append(_least(one, poles, problem.zeros, fewer_poles))
-    expected, whole = found
+        ends.append(_least(one, poles, problem.zeros, fewer_poles))
+    expected, whole = ends
     count, part_count = (sum(data.count for data in one.problem.records) for one in (search, pilot))
     power = sum(data.count * float(np.var(data.y_used)) for data in problem.records)
     if whole.squared_error > min(AS_GOOD * expected.squared_error * count / part_count, (1 - EXPLAINED) * power):
         return None
-    return replace(whole, tried=expected.tried, agree=expected.agree)
+    found = replace(whole, tried=expected.tried, agree=expected.agree)
+    return _with_others(found, search, poles, problem.zeros)
 
 
 @reported("")
@@ -271,7 +286,7 @@ def best_sum(
         search.refine(order, zeros, search.close_delays(order, zeros))
     if known is NOTHING and not problem.monic:
         search.put_first(order, zeros, in_order(search.best(order, zeros), problem.terms, box))
-    return _least(search, order, zeros, False)
+    return _with_others(_least(search, order, zeros, False), search, order, zeros)
 
 
 @reported("")
@@ -332,6 +347,16 @@ def _optimum(best: Local, zeros: int, lost: int, tried: int, agree: int, search:
         integrators=tuple(one.terms[0].integrators for one in problem.arranged(n).channels),
         additive=additive,
     )
+
+
+def _with_others(found: Optimum, search: StructureSearch, poles: int, zeros: int) -> Optimum:
+    """Return an optimum with the other minima of its structure."""
+    others = []
+    for local in search.others(poles - found.poles_at_infinity, zeros):
+        point = local.point
+        start = (point.poles if search.box.parts else point.denominator), point.seconds
+        others.append(OtherMinimum(point.poles, point.seconds, local.squared_error, start))
+    return replace(found, others=tuple(others))
 
 
 def _fractions_of(problem: Problem, point: Point, projected: Projected) -> list[Array]:

@@ -207,15 +207,21 @@ class Descent:
         return across if across.gradient[place] * side < 0 else here
 
     def descend(
-        self, start: Point, known: Sequence[Local] = (), near: float = NEAR, most_steps: int = MOST_STEPS
+        self,
+        start: Point,
+        known: Sequence[Local] = (),
+        near: float = NEAR,
+        most_steps: int = MOST_STEPS,
+        *,
+        to_end: bool = False,
     ) -> Local:
         """Descend by Levenberg-Marquardt steps: Moré's scaling, Nielsen's damping, held coordinates constant.
 
-        A search ends close to a known minimum, at a predicted relative decrease below ``near``, or if it is not
-        expected to reach the lowest known minimum.
+        A search ends close to a known minimum, at a predicted relative decrease below ``near``, or unless ``to_end`` if
+        it is not expected to reach the lowest known minimum.
         """
         here = self.local(start)
-        lowest = min((other.squared_error for other in known), default=np.inf)
+        lowest = min((other.squared_error for other in known), default=np.inf) if not to_end else np.inf
         damping, factor, slow = 1e-3, 2.0, 0
         scale = np.zeros(here.gradient.size)
         for taken in range(most_steps):

@@ -27,6 +27,9 @@ CLOSE_DELAYS = 0.5 ** np.arange(1, 9)
 KEPT = 3
 #: Squared errors that differ by less than this fraction belong to one minimum.
 SAME = 1e-6
+#: Other minima are reported if their squared error exceeds the least by at most this multiple of the noise variance:
+#: three times the 95 % quantile of one degree of freedom.
+COMPETING = 3 * 3.84
 #: Starts whose poles differ by less than this in logarithms count as equal.
 APART = 0.7
 #: Poles are fast if their magnitude times the sampling interval exceeds this.
@@ -87,6 +90,7 @@ class StructureSearch:
         self._given_delays = first_delays
         self._descents: dict[int, Descent] = {}
         self._minima: dict[tuple[int, int], list[Local]] = {}
+        self._competing: dict[tuple[int, int], list[Local]] = {}
         self._ends: dict[tuple[int, int], list[float]] = {}
 
     def descent(self, zeros: int) -> Descent:
@@ -144,7 +148,7 @@ class StructureSearch:
 
     def refine(self, poles: int, zeros: int, points: Iterable[Point]) -> None:
         """Search from points, then in delay cells adjacent to that of the best minimum; keep the lowest minima."""
-        descent, kept = self.descent(zeros), self._minima.setdefault((poles, zeros), [])
+        descent, kept = self.descent(zeros), self._competing.setdefault((poles, zeros), [])
         ends = self._ends.setdefault((poles, zeros), [])
         queue, cells = list(points), set[tuple[int, int]]()
         while queue:
@@ -161,6 +165,25 @@ class StructureSearch:
             if not distinct or local.squared_error > distinct[-1].squared_error * (1 + SAME):
                 distinct.append(local)
         self._minima[poles, zeros] = distinct[:KEPT]
+        limit = distinct[0].squared_error * (1 + COMPETING / descent.count) + descent.floor if distinct else 0.0
+        self._competing[poles, zeros] = [
+            local for k, local in enumerate(distinct) if k < KEPT or local.squared_error <= limit
+        ]
+
+    def others(self, poles: int, zeros: int) -> list[Local]:
+        """Return the further minima of a structure that are nearly as low as its lowest, in ascending order.
+
+        Their searches, which may have ended early because a lower minimum was known, are continued to convergence.
+        """
+        descent, found = self.descent(zeros), [self._minima[poles, zeros][0]]
+        limit = found[0].squared_error * (1 + COMPETING / descent.count) + descent.floor
+        for local in self._competing[poles, zeros]:
+            if local.squared_error <= limit:
+                reached = descent.descend(local.point, found, to_end=True)
+                if all(reached is not one for one in found):
+                    found.append(reached)
+        first = found[0].squared_error * (1 + SAME) + descent.floor
+        return sorted((one for one in found[1:] if one.squared_error > first), key=lambda one: one.squared_error)
 
     def _from_pilot(self, pilot: "StructureSearch", poles: int, zeros: int) -> list[Point]:
         """Return starts from the optimum of a part of the records, and from nested models."""
