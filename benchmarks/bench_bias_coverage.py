@@ -100,7 +100,7 @@ def near_truth(name: str, options: DelayProfile, measured: object) -> MeasuredFi
     models = TWO_INPUTS[name][0]
     delays = tuple(model.delay for model in models)
     poles = models[0].denominator if options.common else np.concatenate([model.poles for model in models])
-    return fitted(measured, measured.local((poles, delays)), None, None)._with_uncertainty("auto", 0)
+    return fitted(measured, measured.local((poles, delays)), None)._with_uncertainty("auto", 0)
 
 
 def main() -> None:

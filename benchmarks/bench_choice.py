@@ -155,7 +155,7 @@ class Case:
         """True structure in its true treatment; the state of an integrator has an offset of the output."""
         state = "rest" if self.at_rest else "estimate"
         offset = "estimate" if self.has_offset and not (self.integrators and not self.at_rest) else "none"
-        return DelayProfile(1, 0, DELAYS, initial_state=state, offset=offset, nested=True)
+        return DelayProfile(1, 0, DELAYS, initial_state=state, offset=offset)
 
 
 def drawn(seed: int, number: int) -> Case:

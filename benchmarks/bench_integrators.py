@@ -42,9 +42,7 @@ def random_case(rng):
     x = x + rng.standard_normal() * np.std(x) * free / np.abs(free).max() + rng.uniform(-2, 2) * np.std(x)
     y = x + rng.standard_normal(samples) * x.std() * 10 ** (-rng.uniform(20, 45) / 20)
     truth = {f"a{k}": value for k, value in enumerate(a[1:], 1)} | {f"b{k}": value for k, value in enumerate(b)}
-    options = DelayProfile(
-        *(n, m, (0.0, 12 * h)), initial_state="estimate", offset="estimate", nested=True, integrators=1
-    )
+    options = DelayProfile(*(n, m, (0.0, 12 * h)), initial_state="estimate", offset="estimate", integrators=1)
     return Record(t, y, HeldSignal(t, u)), truth | {"delay": delay}, poles, options
 
 

@@ -4,7 +4,7 @@
 
 Systems of order 1 to 4 (300 to 600 samples, a third of them irregular, with and without offset, initial state and
 delay) have one or two coefficients fixed, at their true values or off by 20 %. The least output error of
-``DelayProfile(nested=True, fixed=...)``, and of the same fit with nothing fixed, is compared with the least that
+``DelayProfile(fixed=...)``, and of the same fit with nothing fixed, is compared with the least that
 ``scipy.optimize.minimize(method="SLSQP")`` reaches in the same box of admissible poles and delays: from random starts
 moved onto the constraint (the best of them are refined, all of them for every tenth system), from the free optimum
 moved there, and from the true poles. The peer shares no code with ctid: responses are sums over poles, gradients exact,
@@ -329,7 +329,7 @@ def compared(number, asked):
             own["the free optimum"] = free.model.poles, free.model.delay
         if not known or right:
             own["the truth"] = truth.poles, truth.delay
-        estimator = DelayProfile(**options, nested=True, fixed=tuple(Fixed(*pair) for pair in known.items()))
+        estimator = DelayProfile(**options, fixed=tuple(Fixed(*pair) for pair in known.items()))
         spent, fit = cpu(estimator.fit, record)
         free = free or fit
         own["the fit itself"] = fit.model.poles, fit.model.delay

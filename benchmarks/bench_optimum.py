@@ -3,7 +3,7 @@
     python benchmarks/bench_optimum.py [--systems 100] [--seed 1] [--starts 3] [--likes] [--records FOLDER]
     python benchmarks/bench_optimum.py --two-inputs 300 --starts 200
 
-For each system the least output error of ``DelayProfile(nested=True)`` is compared with what ``scipy.optimize`` reaches
+For each system the least output error of ``DelayProfile`` is compared with what ``scipy.optimize`` reaches
 from the true poles, from random ones, and from ctid's own estimate: variable projection on columns of modal responses,
 Jacobians by differences. The peer knows the truth and ctid does not. A line is printed for each system with ctid above
 the peer by more than a millionth, and a summary at the end.
@@ -233,7 +233,7 @@ def random_case(rng):
         for k in range(1, samples):
             e[k] += 0.8 * e[k - 1]
     y = x + e / e.std() * x.std() * 10 ** (-rng.uniform(5, 40) / 20)
-    options = DelayProfile(n, zeros, bounds, initial_state=treatment, offset=offset, nested=True)
+    options = DelayProfile(n, zeros, bounds, initial_state=treatment, offset=offset)
     return Record(t, y, held), model, options
 
 
@@ -387,12 +387,12 @@ def table(asked):
             for zeros in (0, 1):
                 rng = np.random.default_rng([asked.seed, zeros])
                 record, truth, state = like(rng)
-                options = DelayProfile(2, zeros, (0.0, 0.0), initial_state=state, nested=True)
+                options = DelayProfile(2, zeros, (0.0, 0.0), initial_state=state)
                 above.append(tabulated(name, record, options, rng, asked.starts, truth))
     for name, record in measured(asked.records) if asked.records else ():
         state, offset, delays = TREATMENTS.get(name, OTHERWISE)
         for n, m in STRUCTURES:
-            options = DelayProfile(n, m, delays, initial_state=state, offset=offset, nested=True)
+            options = DelayProfile(n, m, delays, initial_state=state, offset=offset)
             try:
                 above.append(tabulated(name, record, options, np.random.default_rng([asked.seed, n]), asked.starts))
             except DataError as error:

@@ -103,7 +103,6 @@ def planted(rng, fault):
         zeros,
         (0.0, 12.0),
         integrators=integrating,
-        nested=True,
         initial_state="estimate" if before else "rest",
         offset="estimate",
     )
@@ -227,7 +226,7 @@ def main():
     for file in given.measured:
         for poles in (1, 2, 3):
             record = read_record(file)
-            typed = DelayProfile(poles, poles - 1, (0.0, 0.0), nested=True)
+            typed = DelayProfile(poles, poles - 1, (0.0, 0.0))
             try:
                 before, found, seconds = remedies_of(record, typed)
             except CtidError as error:

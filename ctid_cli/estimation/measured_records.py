@@ -8,7 +8,6 @@ are common.
 """
 
 from collections.abc import Sequence
-from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -22,9 +21,9 @@ from ctid_cli.estimation.common import check_greatest_delay, check_record
 from ctid_cli.estimation.optimum.best_model import (
     Begin,
     Optimum,
+    best_local,
     best_output_error,
     best_sum,
-    most_active_parts,
     poles_of_submodels,
 )
 from ctid_cli.estimation.optimum.box import Bounds, each_bounds
@@ -35,7 +34,6 @@ from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimation.parameter_layout import Degrees, Layout, SumDegrees
 from ctid_cli.estimation.record_preparation import (
     above_level,
-    part_of_record,
     period_of,
     refuse_collinear,
     within_one_period,
@@ -44,7 +42,6 @@ from ctid_cli.estimation.record_preparation import (
 )
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
 from ctid_cli.inference.innovations import sampled
-from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.sensitivities import Structure, SumStructure
 from ctid_cli.models.additive import AdditiveModel
@@ -52,9 +49,6 @@ from ctid_cli.models.several_inputs import AnyModel, SystemModel, delays_of, fra
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, Offset, OutputHold
-
-#: Number of random starts, plus the same number for each pole.
-RANDOM_STARTS = 2
 
 
 class Treatment(NamedTuple):
@@ -125,11 +119,6 @@ class MeasuredRecords:
         #: Measured outputs at the used samples, minus their means if those are removed.
         self.outputs = [record.y[used_samples(data, record)] - y0 for record, y0, data in each]
 
-    @cached_property
-    def bandwidth(self) -> float:
-        """Highest significant frequency of an output [rad/s]."""
-        return max(output_bandwidth(record) for record in self.records)
-
     @property
     def degrees(self) -> Degrees | SumDegrees:
         """Degrees of the model."""
@@ -148,16 +137,6 @@ class MeasuredRecords:
         other.layout = replace(self.layout, degrees=degrees)
         other.problem = self.problem._replace(**degrees.search_arguments)
         return other
-
-    @property
-    def plain(self) -> bool:
-        """Whether there is a single record without further parameters, with one input and from rest."""
-        treatment, degrees = self.treatment, self.degrees
-        if isinstance(degrees, SumDegrees):
-            return False
-        from_rest = self.layout.own == 0 and treatment.initial_state != "periodic" and not any(treatment.integrators)
-        single = len(self.data) == 1 and not degrees.several
-        return from_rest and single and max(degrees.zeros) < degrees.poles
 
     def _check_input(self, record: Record) -> None:
         """Raise DataError if an input does not determine the model."""
@@ -207,26 +186,6 @@ class MeasuredRecords:
         layout, arguments = self.layout, dict(self.degrees.search_arguments)
         return Problem(data, arguments.pop("zeros"), layout.initial_state, layout.trend, periods, **arguments)
 
-    def part(self) -> "MeasuredRecords | None":
-        """Return the most active parts of long records, with separate initial states; None if they do not suffice."""
-        treatment = self.treatment
-        parts = most_active_parts(self.data, self.greatest_delay)
-        if parts is None or treatment.initial_state == "periodic":
-            return None
-        offset: Offset = "none" if treatment.offset == "remove" else treatment.offset
-        cut = [part_of_record(record, part) for record, part in zip(self.records, parts, strict=True)]
-        with suppress(DataError):
-            own = treatment._replace(initial_state="estimate", offset=offset, bridge=False, input_before=None)
-            return MeasuredRecords(cut, self.degrees, own)
-        return None
-
-    @cached_property
-    def centred(self) -> FilterData:
-        """First record without its means, for starts that do not estimate an offset and an initial state."""
-        if self.treatment.offset not in ("estimate", "drift"):
-            return self.data[0]
-        return self._lay_out(without_means(self.records[0])[0])
-
     @property
     def spread(self) -> float:
         """Sum of the squares of the outputs about the mean of each record."""
@@ -266,33 +225,24 @@ class MeasuredRecords:
         each = zip(self.outputs, errors, weighting.pseudo_errors, strict=True)
         return self.with_outputs([y - r + pseudo for y, r, pseudo in each])
 
-    def best(self, starts: Sequence[Begin], nested: bool) -> Optimum:
-        """Return the least output error from given starts, and if nested from smaller models and random starts.
+    def best(self, starts: Sequence[Begin] = ()) -> Optimum:
+        """Return the least output error, with given starts in addition to those of the search.
 
-        A start of several denominators consists of poles, and sums are extended term by term in any case. With an
-        unknown initial state, an offset or a period, a profile has too few basins: smaller models are needed then.
+        A start of several denominators consists of poles.
         """
-        random_starts = RANDOM_STARTS if nested or self.plain else 0
+        bounds, known = self.treatment.delay_bounds, self.known
         if self.problem.terms:
-            bounds, known = self.treatment.delay_bounds, self.known
-            return best_sum(self.problem, bounds, starts, known=known, random_starts=random_starts)
-        return best_output_error(
-            self.problem,
-            self.degrees.poles - self.problem.integrators,
-            self.treatment.delay_bounds,
-            starts,
-            nested=nested or not self.plain or self.known is not NOTHING,
-            fewer_poles=nested,
-            random_starts=random_starts,
-            known=self.known,
-        )
+            return best_sum(self.problem, bounds, starts, known=known)
+        poles = self.degrees.poles - self.problem.integrators
+        return best_output_error(self.problem, poles, bounds, starts, known=known)
 
     def local(self, *starts: Begin) -> Optimum:
         """Return the least output error in the basins of denominators, without their integrators, and delays."""
+        bounds, known = self.treatment.delay_bounds, self.known
         if self.problem.terms:
-            return best_sum(self.problem, self.treatment.delay_bounds, starts, grown=False, known=self.known)
-        poles, delays = starts[0][0].size - 1, self.treatment.delay_bounds
-        found = best_output_error(self.problem, poles, delays, starts, nested=False, random_starts=0, known=self.known)
+            return best_sum(self.problem, bounds, starts, grown=False, known=known)
+        poles = starts[0][0].size - 1
+        found = best_local(self.problem, poles, bounds, starts, known=known)
         # Starts may omit poles at infinity.
         return replace(found, poles_at_infinity=self.degrees.poles - self.problem.integrators - poles)
 

@@ -48,13 +48,11 @@ def joint_optimum(
     found: Optimum,
     orders: Orders | None,
     starts: Sequence[Begin],
-    *,
-    nested: bool,
 ) -> JointOptimum:
     """Return plant and noise of the greatest likelihood near an output-error optimum; orders by BIC unless given.
 
     The output-error optimum may have fitted the noise: the plant is searched again by the innovations under that noise,
-    from the starts of the output-error search, and if nested from smaller plants too.
+    in long records only near the optimum.
     """
     joint = joint_near(measured, found, orders)
     if not sum(joint.noise.orders):
@@ -63,8 +61,8 @@ def joint_optimum(
     # Structures with poles at infinity are not searched again.
     same_order = [start for start in starts if start[0].size == size]
     starts = [joint.found.start, *same_order]
-    nested = nested and sum(e.size for e in measured.outputs) <= LONG
-    other = white.best(starts, nested) if nested else white.local(*starts)
+    search = sum(e.size for e in measured.outputs) <= LONG
+    other = white.best(starts) if search else white.local(*starts)
     if other.start[0].size != size:
         return joint
     return min((joint, _settled(measured, JointOptimum(other, joint.noise))), key=lambda each: each.noise.deviance)

@@ -178,7 +178,7 @@ class BoundedSearch:
 
         if not along:
             measured = self._knowing(values(None))
-            return measured.best([self._begin(measured, start)], nested=True)
+            return measured.best([self._begin(measured, start)])
         from scipy.optimize import minimize_scalar
 
         best, middle = [start], float(np.log(self._values(start)[next(iter(along))]))

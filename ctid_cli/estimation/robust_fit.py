@@ -48,15 +48,15 @@ class RobustFit:
         return [x + loss.weight(r) * r for x, loss, r in each]
 
 
-def robust_fit(measured: MeasuredRecords, kind: RobustKind, starts: Sequence[Begin], nested: bool) -> RobustFit:
+def robust_fit(measured: MeasuredRecords, kind: RobustKind, starts: Sequence[Begin]) -> RobustFit:
     """Search for the least Huber loss, and from there for the least Tukey loss.
 
     The first search uses outputs with interpolated outliers, the next ones the modified outputs of the last fit.
     """
-    best = _descend(measured, measured.best(starts, nested), "huber")
+    best = _descend(measured, measured.best(starts), "huber")
     for _ in range(MOST_SEARCHES):
         at = [best.found.start, *starts]
-        trial = _descend(measured, measured.with_outputs(best.modified()).best(at, nested), "huber")
+        trial = _descend(measured, measured.with_outputs(best.modified()).best(at), "huber")
         smaller = [min(pair, key=lambda loss: loss.scale) for pair in zip(best.losses, trial.losses, strict=True)]
         if trial.cost(smaller) > best.cost(smaller) * (1.0 - WORTHWHILE):
             break

@@ -1,4 +1,4 @@
-"""Global estimation from measured records: one-dimensional search over the delay, then output-error minimisation."""
+"""Global output-error minimisation for measured records, with the delay."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +15,6 @@ from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimation.parameter_bounds import BoundedSearch, Quantity, quantities_of
 from ctid_cli.estimation.parameter_layout import Degrees
-from ctid_cli.estimation.profile_search import Profile, search_delay
 from ctid_cli.estimation.robust_fit import robust_fit, robust_local
 from ctid_cli.estimators.measured_fit import (
     FittedSamples,
@@ -54,23 +53,16 @@ class RecordsEstimator(Estimator[MeasuredRecords, MeasuredFit]):
     noise_model: str
     integrators: int
 
-    def _least(
-        self,
-        measured: MeasuredRecords,
-        starts: Sequence[Begin],
-        profile: Profile | None = None,
-        *,
-        nested: bool = False,
-    ) -> MeasuredFit:
-        """Return the optimum from starts for the given loss and noise model, without a covariance."""
+    def _least(self, measured: MeasuredRecords, starts: Sequence[Begin] = ()) -> MeasuredFit:
+        """Return the optimum for the given loss and noise model, without a covariance."""
         if self.loss != "squares":
-            robust = robust_fit(measured, self.loss, starts, nested)
-            return fitted(measured, robust.found, profile, robust)
-        found = measured.best(starts, nested)
-        fit = fitted(measured, found, profile, None)
+            robust = robust_fit(measured, self.loss, starts)
+            return fitted(measured, robust.found, robust)
+        found = measured.best(starts)
+        fit = fitted(measured, found, None)
         if self.noise_model == "white":
             return fit
-        return with_noise(measured, fit, found, self.noise_model, starts, nested=nested)
+        return with_noise(measured, fit, found, self.noise_model, starts)
 
     def _simulated(self, fit: MeasuredFit, measured: MeasuredRecords) -> list[Array]:
         """Return the outputs of a fit, without removed means, at the used samples of prepared records."""
@@ -126,7 +118,7 @@ class InputModel:
 
 @dataclass(frozen=True)
 class DelayProfile(RecordsEstimator):
-    """Global search over the delay, refined by output-error minimisation with initial state and offset.
+    """Global output-error minimisation over poles, zeros and delay, with initial state and offset.
 
     Parameters
     ----------
@@ -145,11 +137,6 @@ class DelayProfile(RecordsEstimator):
     loss : {"squares", "huber", "tukey"}, default "squares"
         Loss function of the output errors: squares; quadratic up to 1.345 standard deviations and linear beyond
         (Huber); or constant beyond 4.685 standard deviations (Tukey's biweight), for records with outliers.
-    svf_cutoff : float, optional
-        Cut-off of the state-variable filter of the starts [rad/s]; by default from the bandwidth of the output.
-    nested : bool, default False
-        Whether nested smaller models are fitted too, and random starts used: slower, but the cost then never increases
-        with the number of poles or zeros. Otherwise only the minima of the profile are refined.
     hold_output : {"foh", "zoh"}, default "foh"
         Interpolation of the measured output between samples; does not affect the estimate.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
@@ -188,11 +175,11 @@ class DelayProfile(RecordsEstimator):
 
     Notes
     -----
-    The cost, minimised over all parameters except the delay, is computed on a grid with a spacing of a quarter period
-    of the highest significant frequency of the output (95 % of its power), so that no basin is missed. If possible,
-    long grids are searched from coarse to fine: a low-pass filter with a third of that bandwidth needs a third of the
-    delays, and the next level searches only around the best of them. The best local minima are refined jointly in all
-    parameters on all samples, and the lowest is kept: no start is required.
+    No start is required. The cost, minimised over the numerator, the initial state and the offset, is a function of
+    poles and delay. All smaller models that the structure contains are fitted first: their lowest minima, with further
+    poles at the best of many frequencies and dampings, are starts, and so are minima along the whole range of the
+    delay and a few random points. The lowest minimum is kept. The cost never increases with the number of poles or
+    zeros: if a smaller model fits as well, the result has fewer poles.
 
     Without bounds the least cost need not exist: with an undamped pole a free initial state can fit noise without
     limit. With an estimated state, poles have magnitudes of at least the reciprocal of the record's length, and pairs a
@@ -208,6 +195,8 @@ class DelayProfile(RecordsEstimator):
     """
 
     kind: ClassVar[str] = "delay_profile"
+    #: Types and defaults of options of earlier versions, which have no effect.
+    former: ClassVar[Mapping[str, tuple[Any, Any]]] = {"svf_cutoff": (float | None, None), "nested": (bool, False)}
 
     poles: int
     zeros: int
@@ -215,8 +204,6 @@ class DelayProfile(RecordsEstimator):
     initial_state: InitialState = "rest"
     offset: Offset = "none"
     loss: LossKind = "squares"
-    svf_cutoff: float | None = None
-    nested: bool = False
     hold_output: OutputHold = "foh"
     covariance: Covariance = "auto"
     bootstrap_draws: int = DRAWS
@@ -363,25 +350,15 @@ class DelayProfile(RecordsEstimator):
     def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
         if self.bounds:
             return self._within_bounds(measured)._with_uncertainty(self.covariance, self.bootstrap_draws)
-        if measured.degrees.several:
-            # Each of several inputs is searched separately first.
-            fit = self._least(measured, [], nested=True)
-            return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
-        for minima, profile in search_delay(measured, self.svf_cutoff, self.nested):
-            if minima:
-                a = [np.concatenate(([1.0], minimum.theta[: self.poles])) for minimum in minima]
-                starts = [(each, minimum.delay) for each, minimum in zip(a, minima, strict=True)]
-                fit = self._least(measured, starts, profile, nested=self.nested)
-                return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
-        raise DataError(Status.SINGULAR.value)
+        return self._least(measured)._with_uncertainty(self.covariance, self.bootstrap_draws)
 
     def _within_bounds(self, measured: MeasuredRecords) -> MeasuredFit:
         """Return the least output error within the bounds of parameters, without a covariance."""
         names = measured.degrees.inputs
         known, degrees = self._known(names) if self.fixed else {}, self._degrees(names, free=False)
         search = BoundedSearch(measured, self._quantities(names), degrees, known)
-        found, ends = search.within(measured.best([], nested=True))
-        fit = fitted(measured, found, None, None)
+        found, ends = search.within(measured.best())
+        fit = fitted(measured, found, None)
         if not ends:
             return fit
         layout = measured.layout_of(fit.model)
@@ -398,9 +375,9 @@ class DelayProfile(RecordsEstimator):
         measured = self._lay_out(records)
         found = measured.local(*near)
         if self.loss == "squares":
-            return fitted(measured, found, None, None)
+            return fitted(measured, found, None)
         robust = robust_local(measured, self.loss, found)
-        return fitted(measured, robust.found, None, robust)
+        return fitted(measured, robust.found, robust)
 
 
 def check_treatment(options: RecordsEstimator) -> None:

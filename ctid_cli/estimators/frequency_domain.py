@@ -42,7 +42,7 @@ class FrequencyDomainFit(MeasuredFit):
     model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`; a sample is a weighted real or imaginary part,
         and means are not subtracted in ``fit_percent`` and ``r2``.
-    history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
+    history, theta, initial_states, offsets, input_offsets, residuals, sensitivities, used, starts
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`; ``used`` refers to the real parts of all lines,
         then the imaginary parts.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
@@ -158,7 +158,7 @@ class FrequencyDomainSumFit(FrequencyDomainFit, SubmodelsFit):
     ----------
     model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number, data
         As in :class:`FrequencyDomainFit`; ``model`` is the sum as one transfer function.
-    history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
+    history, theta, initial_states, offsets, input_offsets, residuals, sensitivities, used, starts
         As in :class:`FrequencyDomainFit`.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`FrequencyDomainFit`.
@@ -225,9 +225,7 @@ class FrequencyDomain(_OfLines, DelayProfile):
     """
 
     delay_bounds: tuple[float, float] = (0.0, 0.0)
-    # These too are for records in time only.
-    svf_cutoff: float | None = field(init=False, default=None)
-    nested: bool = field(init=False, default=False)
+    # This too is for records in time only.
     hold_output: OutputHold = field(init=False, default="foh")
 
     def prepare(self, record: Any) -> Prepared[MeasuredRecords, MeasuredFit]:
@@ -249,7 +247,7 @@ class FrequencyDomain(_OfLines, DelayProfile):
 
     def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
         own = _lines(measured)
-        found = self._within_bounds(own) if self.bounds else fitted(own, own.best([], True), None, None)
+        found = self._within_bounds(own) if self.bounds else fitted(own, own.best(), None)
         return FrequencyDomainFit(**_values(found), data=own.source)._with_uncertainty("auto", DRAWS)
 
 
@@ -297,7 +295,7 @@ class FrequencyDomainSum(_OfLines, AdditiveOutputError):  # noqa: N818 - not an 
 
     def _estimate(self, measured: MeasuredRecords, start: Start | None) -> SubmodelsFit:
         own = _lines(measured)
-        found = fitted(own, own.best([], True), None, None)
+        found = fitted(own, own.best(), None)
         size = sum(term.size for term in self.terms)
         additive = AdditiveModel.from_theta(found.theta[:size], self.terms, found.model.delay)
         fit = FrequencyDomainSumFit(**_values(found), data=own.source, additive=additive, start_method=GROWN)

@@ -2,13 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
+from ctid_cli.estimation.delay_search import quarter_periods
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords
+from ctid_cli.estimation.optimum.best_model import part_of
+from ctid_cli.estimation.optimum.box import each_bounds
+from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.frequency_domain import (
@@ -33,6 +38,7 @@ from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.fit import DeferredFields, InputFit
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.innovations import sampled
+from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.intervals import BIASED, DelayInterval, UncertainValue
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate
@@ -58,6 +64,9 @@ Options = (
     | FrequencyDomainSum
 )
 LaidOut = MeasuredRecords | LaidOutSubmodels | LaidOutLoop
+#: Profile of the cost over the range of the delay: largest number of delays, and predicted relative decrease and number
+#: of steps that end the descent at each of them.
+MOST_DELAYS, ROUGH = 200, (3e-3, 10)
 #: Plot of the cost: number of delays about the estimate, and half-range in half-widths of the interval.
 DRAWN_DELAYS, DRAWN_INTERVALS = 24, 2.5
 
@@ -279,6 +288,11 @@ class Identification(DeferredFields, FittedModel, Shown):
         found = self.fit.of_input(name)
         return found if self._determined else replace(found, law=self.uncertainty.undefined)
 
+    @cached_property
+    def profile(self) -> "Profile | None":
+        """Cost over the range of the delay; None if the delay is known, or one of several."""
+        return profile_of_delay(self)
+
     @property
     def _determined(self) -> bool:
         """Whether the record contains information on the parameters."""
@@ -400,6 +414,41 @@ class DelayCosts(NamedTuple):
     def percent_above(self, costs: Any) -> Any:
         """Return costs relative to the least, minus one [%]."""
         return 100.0 * (costs / self.least - 1.0)
+
+
+class Profile(NamedTuple):
+    """Cost over the whole range of the delay, minimised over all other parameters from the estimate."""
+
+    #: Delays [s], shape (K,).
+    delays: Array
+    #: Mean squared output error [output unit^2], shape (K,).
+    costs: Array
+    #: Number of used samples, which of long records are the most active part.
+    samples: int
+
+
+def profile_of_delay(result: Identification) -> Profile | None:
+    """Return the cost over the range of the delay; None for a known delay, several inputs, a sum or a loop.
+
+    The spacing is a quarter period of the bandwidth of the output, unless these are too many delays. At each one the
+    descent starts from the poles at the next one, towards that of the estimate.
+    """
+    laid_out = None if isinstance(result.fit, MultiInputFit) else result.options.prepare(result.records).laid_out
+    if not isinstance(laid_out, MeasuredRecords) or laid_out.problem.terms or "delay" not in result.fit.parameter_names:
+        return None
+    ((low, high),) = each_bounds(laid_out.treatment.delay_bounds)
+    problem = part_of(laid_out.problem, high) or laid_out.problem
+    bandwidth = max(output_bandwidth(record) for record in laid_out.records)
+    delays = quarter_periods(low, high, bandwidth, MOST_DELAYS)
+    costs, count = np.zeros(delays.size), sum(data.y_used.size for data in problem.records)
+    start, first = laid_out.free_poles(result.fit.model), int(np.searchsorted(delays, delays_of(result.fit.model)[0]))
+    for places in (range(first, delays.size), range(first - 1, -1, -1)):
+        poles = start
+        for k in places:
+            delay = float(delays[k])
+            found = local_minimum(problem, poles, delay, (delay, delay), *ROUGH, known=laid_out.known)
+            poles, costs[k] = found.point.poles, found.squared_error / count
+    return Profile(delays, costs, count)
 
 
 def costs_about_delay(result: Identification) -> DelayCosts | None:

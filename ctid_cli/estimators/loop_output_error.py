@@ -59,7 +59,7 @@ class LoopFit(MeasuredFit):
     ----------
     model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
-    history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
+    history, theta, initial_states, offsets, input_offsets, residuals, sensitivities, used, starts
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.

@@ -17,7 +17,6 @@ from ctid_cli.estimation.optimum.best_model import Begin, Optimum
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimation.parameter_layout import Layout
-from ctid_cli.estimation.profile_search import Profile
 from ctid_cli.estimation.robust_fit import RobustFit
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.inference.criteria import percent_from_r_squared
@@ -70,8 +69,6 @@ class MeasuredFit(DeferredFields, Fit):
         Output offset of each experiment [output unit]; the subtracted mean if means were removed.
     input_offsets : tuple of float
         Subtracted mean of the input [input unit]; 0 without.
-    profile : Profile or None
-        Search over the delay; None for a known delay.
     residuals : tuple of ndarray
         Output errors at the used samples of each experiment [output unit].
     sensitivities : tuple of ndarray
@@ -99,12 +96,13 @@ class MeasuredFit(DeferredFields, Fit):
     """
 
     deferred: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
+    #: Fields in files of earlier versions.
+    former: ClassVar[tuple[str, ...]] = ("profile",)
 
     theta: Array = field(default_factory=lambda: np.zeros(0))
     initial_states: tuple[Array, ...] = ()
     offsets: tuple[float, ...] = ()
     input_offsets: tuple[float, ...] = ()
-    profile: Profile | None = None
     residuals: tuple[Array, ...] = field(default_factory=tuple)
     sensitivities: tuple[Array, ...] = field(default_factory=tuple)
     used: tuple[BoolArray, ...] = field(default_factory=tuple)
@@ -219,7 +217,7 @@ class MultiInputFit(MeasuredFit):
         Transfer functions of the inputs.
     parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number, history, law
         As in :class:`MeasuredFit`.
-    in_ignored_loop, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
+    in_ignored_loop, theta, initial_states, offsets, input_offsets, residuals, sensitivities, used, starts
         As in :class:`MeasuredFit`; ``input_offsets`` has those of all inputs, record by record.
     poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`MeasuredFit`.
@@ -292,7 +290,6 @@ class FittedSamples(NamedTuple):
 def fitted(
     measured: MeasuredRecords,
     found: Optimum,
-    profile: Profile | None,
     robust: RobustFit | None,
 ) -> MeasuredFit:
     """Return the result of a refinement, without its covariance."""
@@ -321,7 +318,6 @@ def fitted(
         initial_states=states,
         offsets=offsets,
         input_offsets=tuple(measured.input_offsets),
-        profile=profile,
         residuals=residuals,
         sensitivities=samples.sensitivities,
         used=samples.used,
@@ -343,12 +339,10 @@ def with_noise(
     found: Optimum,
     noise_model: str,
     starts: Sequence[Begin],
-    *,
-    nested: bool = False,
 ) -> MeasuredFit:
     """Return the maximum-likelihood fit of plant and noise, with an output-error fit for comparison."""
-    joint = joint_optimum(measured, found, orders_of(noise_model), starts, nested=nested)
-    fit = fitted(measured, replace(joint.found, tried=found.tried, agree=found.agree), output_error.profile, None)
+    joint = joint_optimum(measured, found, orders_of(noise_model), starts)
+    fit = fitted(measured, replace(joint.found, tried=found.tried, agree=found.agree), None)
     shared = measured.layout_of(fit.model).degrees.size
     return beside_output_error(fit, joint.noise, output_error, shared, chosen=noise_model == "auto")
 

@@ -164,7 +164,7 @@ class Structures:
             size = laid_out.layout.size - options.integrators
             if SAMPLES_PER_PARAMETER * size > sum(data.count for data in measured.data):
                 return None
-            found = fitted(laid_out, self._least(poles, zeros), None, None)
+            found = fitted(laid_out, self._least(poles, zeros), None)
             candidate = Candidate(options, self.hold, found, size)
             self.found[poles, zeros] = self._with_fewer_zeros(candidate) if self.fewer_zeros else candidate
         return self.found[poles, zeros]
@@ -204,7 +204,7 @@ class Structures:
         names = self.measured.degrees.inputs
         inputs = tuple(replace(own.get(name, InputModel(name)), zeros=m) for name, m in zip(names, zeros, strict=True))
         laid_out, search = self._quick(zeros, point)
-        fit = fitted(laid_out, best_near(search, max(zeros), point), None, None)
+        fit = fitted(laid_out, best_near(search, max(zeros), point), None)
         size = laid_out.layout.size - candidate.options.integrators
         return replace(candidate, options=replace(candidate.options, inputs=inputs), fit=fit, size=size)
 
@@ -257,7 +257,7 @@ class Sums:
         size = measured.layout.size
         if SAMPLES_PER_PARAMETER * size > sum(data.count for data in measured.data):
             return None
-        fit = options._of_submodels(measured, options._least(measured, []), GROWN)
+        fit = options._of_submodels(measured, options._least(measured), GROWN)
         return Candidate(options, self.hold, fit, size)
 
 

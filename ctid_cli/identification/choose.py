@@ -152,7 +152,7 @@ class _Choosing:
         best = ranking.best
         options = replace(options, loss=self.given.loss or "squares", noise_model=self.given.noise_model)
         if isinstance(options, DelayProfile):
-            options = replace(options, fixed=self.given.fixed, bounds=self.given.bounds, nested=True)
+            options = replace(options, fixed=self.given.fixed, bounds=self.given.bounds)
         if not self.from_start:
             options = replace(options, initial_state="estimate", input_before=None)
         fitted = tuple(self._held(setting))

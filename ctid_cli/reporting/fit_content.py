@@ -47,7 +47,7 @@ def fit_content(
 ) -> dict[str, Any]:
     """Return the fit for ``fit.json`` and ``ctid fit --json``."""
     fit, options, criteria = fitted.fit, fitted.options, fitted.criteria
-    profile, validation = fit.profile, fitted.validation
+    profile, validation = fitted.profile, fitted.validation
     measurements, units = records.measurements, units or records.units
     hold = measurements[0].record.hold if measurements else None
     content = {
@@ -82,7 +82,7 @@ def fit_content(
         "conditions": picked(fit, ("consistency", "sampling", "two_stage")) if isinstance(fit, SubmodelsFit) else None,
         "iterations": fit.iterations,
         "residual_tests": [picked(test, TEST_KEYS) for test in fitted.tests],
-        "profile": profile and picked(profile, ("delays", "costs", "cutoff", "samples")),
+        "profile": profile and {**profile._asdict(), "cutoff": None},
         "validation": validation and _validation_object(validation, records.validation, fit.noise, predicted),
         "records": [_record_object(item, use) for item, use in zip(measurements, fit.used, strict=False)],
         "units": asdict(units),

@@ -118,9 +118,9 @@ class FitFigures:
         return len(fractions_of(self.result.fit.model))
 
     def draw_profile(self, axes: Any) -> None:
-        """Draw the search over the delay."""
+        """Draw the cost over the range of the delay."""
         fit, units = self.result.fit, self.units
-        profile, found = fit.profile, f"{self.delay:.4g} {units.time}"
+        profile, found = self.result.profile, f"{self.delay:.4g} {units.time}"
         if profile is None:
             low, high = self.result.options.delay_bounds
             label = plain(f"{'estimated' if low < high else 'known'} delay {found}")
@@ -128,12 +128,11 @@ class FitFigures:
         else:
             whole = profile.samples >= fit.count
             part = "" if whole else f" of the most active {profile.samples} samples"
-            part += "" if profile.cutoff is None else f" below {profile.cutoff:.3g} rad/{units.time}"
             axes.plot(profile.delays, profile.costs, ".-", color=DARK, lw=0.8, ms=4, label=plain(f"profile{part}"))
-            if profile.cutoff is None and whole and fit.noise is None:
+            if whole and fit.noise is None:
                 axes.plot([self.delay], [fit.cost], "v", color="black", ms=7, label=plain(f"minimum at {found}"))
             else:
-                # The cost of the estimate uses all frequencies and samples, or the innovations.
+                # The cost of the estimate uses all samples, or the innovations.
                 what = "minimum at" if fit.noise is None else "estimate with the noise model:"
                 axes.axvline(self.delay, color="black", linewidth=0.8, label=plain(f"{what} {found}"))
         low, high = axes.get_ylim()

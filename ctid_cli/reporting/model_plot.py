@@ -169,7 +169,7 @@ def figure_chapters(figures: FitFigures, main: Drawing, validation: Measurement 
     result, units = figures.result, figures.units
     outcome, more = result.validation, len(figures.measurements) - MOST_DRAWN
     several, left = len(models_of(result)) > 1, result.fit.left_over
-    what = "responses to each input" if several else "the search over the delay"
+    what = "responses to each input" if several else "the cost over the delay"
     found = [Section(drawing=main, caption=f"Output, residuals, autocorrelation of the {left}, and {what}.")]
     found += [Section(sentences=[f"{more} more experiments are not drawn."])] if more > 0 else []
     if result.tests and not several:
@@ -183,7 +183,7 @@ def figure_chapters(figures: FitFigures, main: Drawing, validation: Measurement 
     if not several:
         yield Chapter("Responses", _responses(figures))
     yield poles_chapter(result, units)
-    near = None if result.fit.profile is None else costs_about_delay(result)
+    near = None if result.profile is None else costs_about_delay(result)
     if near is not None:
         drawing = delay_drawing(near, figures.delay, units)
         yield Chapter("Delay", [Section(drawing=drawing, caption="Cost about the estimated delay.")])

@@ -26,7 +26,7 @@ from ctid_cli.simulation.start_points import additive_form
 from ctid_cli.specification import sweeps
 from ctid_cli.specification.custom_sections import CustomMeasureSection
 from ctid_cli.specification.messages import Violation
-from ctid_cli.specification.sections import place_of
+from ctid_cli.specification.sections import former_options, place_of
 from ctid_cli.specification.spec import OF_DATA, Spec
 from ctid_cli.specification.sweeps import Case, Cases
 from ctid_cli.specification.system_sections import RelativeStart, UniformStart, truth_of
@@ -435,6 +435,11 @@ def joint_warnings(spec: Spec) -> list[Violation]:
     """Return the warnings."""
     cases = cases_of(spec)
     warnings = [*sweeps.checked(cases, WARNINGS), *sweeps.checked(cases, (_of_sampled_input,), MAX_TRIALS)]
+    for name, section in spec.estimators.items():
+        for option, (_, default) in former_options(section.target).items():
+            if getattr(section, option) != default:
+                place = ("estimators", name, option)
+                warnings.append((place, "has no effect: every search has all starts; leave it out"))
     if spec.starts is not None:
         first = [sweeps.variants(section)[0].options for section in spec.estimators.values()]
         taken = {getattr(options, "start_from", None) for options in first}

@@ -48,6 +48,7 @@ class Section(BaseModel):
     def descriptions(cls) -> dict[str, str]:
         """Return the description of each key from the docstring of the section or of its option dataclass."""
         docs = {"kind": "Which one it is"} | option_docs(cls.target or cls) | option_docs(cls)
+        docs |= dict.fromkeys(former_options(cls.target), "An option of earlier versions, which has no effect")
         return {name: docs.get(name, "") for name in cls.model_fields}
 
     @classmethod
@@ -172,6 +173,11 @@ def geometric_sizes(first: int, last: int, count: int) -> list[int]:
     return sizes
 
 
+def former_options(target: type | None) -> Mapping[str, tuple[Any, Any]]:
+    """Return the types and defaults of options of earlier versions, which have no effect."""
+    return getattr(target, "former", {})
+
+
 def section_for(
     target: type, kind: str = "", *, sweeping: bool = True, without: str = "", base: type[Section] = Section
 ) -> type[Section]:
@@ -188,6 +194,10 @@ def section_for(
             spaced = {"mapping": Annotated[Geometric, AfterValidator(Geometric.values)]}
             form = Annotated[Any, Swept(form, **(spaced if option.metadata.get("geometric") else {}))]
         fields[option.name] = (form, _default(option))
+    for name, (hint, default) in former_options(target).items():
+        # A part of the identity of estimates.
+        form, scalar = _form(hint, f"{target.__name__}.{name}")
+        fields[name] = (Annotated[Any, Swept(form)] if scalar and sweeping else form, default)
     summary = ((target.__doc__ or "").strip() or target.__name__).splitlines()[0]
     section = pydantic.create_model(target.__name__, __base__=base, __doc__=summary, **fields)
     section.target = target

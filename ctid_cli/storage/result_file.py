@@ -246,7 +246,7 @@ def _instance(content: Any, kind: type, place: str) -> Any:
     # Older files lack fields added since.
     later = {name for name in hints if defaults[name] is not dataclasses.MISSING}
     known = isinstance(content, Mapping) and content.get("type") == kind.__name__
-    if not known or not {*hints} - later <= {*content} - {"type"} <= {*hints}:
+    if not known or not {*hints} - later <= {*content} - {"type"} <= {*hints, *getattr(kind, "former", ())}:
         _refuse_part(place)
     values = {name: decoded(content[name], hint, f"{place}.{name}") for name, hint in hints.items() if name in content}
     late = dict.fromkeys(kind.deferred, ()) if issubclass(kind, DeferredFields) else {}

@@ -31,7 +31,7 @@ def test_a_second_numerator_fixed_at_zero_leaves_the_fit_of_the_first_input():
     record = record_of(FIRST, SECOND)
     inputs = (InputModel("u2", zeros=0, delay_bounds=(0.5, 0.5)),)
     both = DelayProfile(2, 1, (0.0, 2.0), inputs=inputs, fixed=(Fixed("u2_b0", 0.0),)).fit(record)
-    one = DelayProfile(2, 1, (0.0, 2.0), nested=True).fit(record.of_input("u1"))
+    one = DelayProfile(2, 1, (0.0, 2.0)).fit(record.of_input("u1"))
     assert both.cost == pytest.approx(one.cost, rel=1e-9)
     part = both.of_input("u1").model
     np.testing.assert_allclose(part.denominator, one.model.denominator, rtol=1e-5)
@@ -94,7 +94,7 @@ def test_gradients_of_the_projected_cost_are_exact(name, repeated):
 @pytest.mark.parametrize("name", ["common", pytest.param("integrating", marks=pytest.mark.slow)])
 def test_sensitivities_are_the_derivatives_of_the_output(name):
     measured = PROBLEMS[name].prepare(record_of(FIRST, SECOND)).laid_out
-    model = measured.model(measured.best((), True))
+    model = measured.model(measured.best())
     layout, rng = measured.layout_of(model), np.random.default_rng(1)
     theta = layout.theta(model)
     free = np.flatnonzero(theta != 0.0)

@@ -13,7 +13,7 @@ from ctid_cli.estimation.optimum.chain import all_numerators, numerators, polyno
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
 from ctid_cli.estimation.optimum.projection import Problem, Projected
 from ctid_cli.estimation.optimum.search import Ending, Local
-from ctid_cli.estimation.optimum.starts import SAME, StructureSearch, block_starts
+from ctid_cli.estimation.optimum.starts import SAME, THOROUGH, StructureSearch, block_starts
 from ctid_cli.estimation.optimum.sum_starts import SumGrowth, in_order
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.sensitivities import SumStructure
@@ -140,72 +140,74 @@ def best_output_error(
     delays: Bounds = (0.0, 0.0),
     starts: Sequence[Begin] = (),
     *,
-    nested: bool = True,
-    fewer_poles: bool = True,
-    random_starts: int = 10,
-    seed: int = 0,
     known: KnownCoefficients = NOTHING,
 ) -> Optimum:
     """Return the least sum of squared output errors of a structure and of all nested ones.
 
-    Equal bounds of the delay [s] fix it, which a model with equal degrees requires. Searches start from denominators
-    and delays of other estimators. ``nested``: the nested smaller models are fitted too, and their minima are starts;
-    otherwise only the given starts are refined. ``fewer_poles``: the least of all is returned, possibly with fewer
-    poles, so that the cost never increases with the structure. ``random_starts``: number of random starts, plus the
-    same number for each pole, also for the smaller models; not nested, only if the given starts disagree.
+    Equal bounds of the delay [s] fix it, which a model with equal degrees requires. Searches start from the minima of
+    nested smaller models, from random points, and from given denominators and delays. Without known coefficients the
+    result may have fewer poles, so that the cost never increases with the structure.
     """
-    zeros, box = problem.zeros, box_of(problem, delays)
-    if known.all_poles:
-        box = widened(box, known.poles)
+    zeros, box = problem.zeros, _box(problem, delays, known)
     points = [_point(start, box) for start in starts]
-    search = StructureSearch(problem, box, random_starts, seed)
-    part = part_of(problem, max(high for _, high in box.each_delay)) if nested else None
+    part = part_of(problem, max(high for _, high in box.each_delay))
     if known is not NOTHING:
         if part is not None:
-            there = best_output_error(part, poles, delays, starts, random_starts=random_starts, seed=seed, known=known)
-            points, nested = [_point(there.start, box)], False
-        search = _with_known(search, poles, points, nested, known)
+            there = best_output_error(part, poles, delays, starts, known=known)
+            return best_local(problem, poles, delays, [there.start], known=known)
+        search = _with_known(StructureSearch(problem, box), poles, points, known)
         return _with_others(_least(search, poles, zeros, False), search, poles, zeros)
     if part is not None:
-        pilot = StructureSearch(part, box_of(part, delays), random_starts, seed)
-        found = _from_part(StructureSearch(problem, box, pilot=pilot), pilot, poles, fewer_poles)
+        pilot = StructureSearch(part, box_of(part, delays))
+        found = _from_part(StructureSearch(problem, box, pilot=pilot), pilot, poles)
         if found is not None:
             return found
-    if nested or not points:
-        search.climb(poles, zeros)
-        points += search.resonances(poles, zeros)
-    search.refine(poles, zeros, points)
-    if nested:
-        search.refine(poles, zeros, search.close_delays(poles, zeros))
-        return _with_others(_least(search, poles, zeros, fewer_poles), search, poles, zeros)
-    found = _least(search, poles, zeros, False)
-    if (found.tried > 1 and found.agree == 1) or not found.ending.optimal:
-        search.refine(poles, zeros, search.random_points(poles))
-        found = _least(search, poles, zeros, False)
-    return found
+    search = StructureSearch(problem, box)
+    search.climb(poles, zeros)
+    search.refine(poles, zeros, points + search.resonances(poles, zeros))
+    search.refine(poles, zeros, search.close_delays(poles, zeros))
+    return _with_others(_least(search, poles, zeros, True), search, poles, zeros)
 
 
-def _with_known(
-    free: StructureSearch, poles: int, points: list[Point], nested: bool, known: KnownCoefficients
-) -> StructureSearch:
-    """Return the search of models with known coefficients, from points projected onto the constraints.
+@reported("")
+def best_local(
+    problem: Problem,
+    poles: int,
+    delays: Bounds,
+    starts: Sequence[Begin],
+    *,
+    known: KnownCoefficients = NOTHING,
+) -> Optimum:
+    """Return the least sum of squared output errors in the basins of denominators and delays."""
+    box = _box(problem, delays, known)
+    search = StructureSearch(problem, box, known=known)
+    search.refine(poles, problem.zeros, _met([_point(start, box) for start in starts], box, known))
+    return _least(search, poles, problem.zeros, False)
 
-    If nested, the points include all minima found without the constraints, and random points.
+
+def _box(problem: Problem, delays: Bounds, known: KnownCoefficients) -> Box:
+    """Return the admissible set, which contains known poles."""
+    box = box_of(problem, delays)
+    return widened(box, known.poles) if known.all_poles else box
+
+
+def _with_known(free: StructureSearch, poles: int, points: list[Point], known: KnownCoefficients) -> StructureSearch:
+    """Return the search of models with known coefficients.
+
+    It starts from given points, all minima found without the constraints, and random points, projected onto the
+    constraints.
     """
     zeros, box = free.problem.zeros, free.box
     search = StructureSearch(free.problem, box, known=known)
-    if nested and known.all_poles:
+    if known.all_poles:
         points = [point_of(known.poles, box.middle, box)]
-    elif nested:
+    else:
         free.climb(poles, zeros)
         points += [local.point for local in free.minima(poles, zeros)] + free.from_below(poles, zeros)
         points += free.resonances(poles, zeros) + free.random_points(poles)
-    points = _met(points, box, known)
-    if nested:
-        points = search.along_delay(zeros, search.descent(zeros).sorted(points))
-    search.refine(poles, zeros, points)
-    if nested:
-        search.refine(poles, zeros, search.close_delays(poles, zeros))
+    points = search.descent(zeros).sorted(_met(points, box, known))
+    search.refine(poles, zeros, search.along_delay(zeros, points))
+    search.refine(poles, zeros, search.close_delays(poles, zeros))
     return search
 
 
@@ -223,12 +225,12 @@ def _met(points: Sequence[Point], box: Box, known: KnownCoefficients) -> list[Po
     return found
 
 
-def _from_part(search: StructureSearch, pilot: StructureSearch, poles: int, fewer_poles: bool) -> Optimum | None:
+def _from_part(search: StructureSearch, pilot: StructureSearch, poles: int) -> Optimum | None:
     """Return the optimum found from a part of the records; None if it does not fit the whole records."""
     problem, ends = search.problem, list[Optimum]()
     for one in (pilot, search):
         one.climb(poles, problem.zeros)
-        ends.append(_least(one, poles, problem.zeros, fewer_poles))
+        ends.append(_least(one, poles, problem.zeros, True))
     expected, whole = ends
     count, part_count = (sum(data.count for data in one.problem.records) for one in (search, pilot))
     power = sum(data.count * float(np.var(data.y_used)) for data in problem.records)
@@ -253,8 +255,6 @@ def best_sum(
     *,
     grown: bool = True,
     known: KnownCoefficients = NOTHING,
-    random_starts: int = 0,
-    seed: int = 0,
 ) -> Optimum:
     """Return the least sum of squared output errors of fractions with separate denominators.
 
@@ -262,15 +262,13 @@ def best_sum(
     the whole range of the delays, and so are the poles of submodels found term by term, and of inputs fitted to the
     residual of the others.
     """
-    box, order, zeros = box_of(problem, delays), sum(problem.parts), problem.zeros
-    if known.all_poles:
-        box = widened(box, known.poles)
-    search = StructureSearch(problem, box, random_starts, seed, known=known)
+    box, order, zeros = _box(problem, delays, known), sum(problem.parts), problem.zeros
+    search = StructureSearch(problem, box, known=known)
     points = [_point(start, box) for start in starts]
     if grown:
         points = [each for point in points for each in search.along_delay(zeros, [point])]
         if box.several_delays:
-            points += block_starts(problem, box, random_starts, seed)
+            points += block_starts(problem, box, THOROUGH)
         elif not known.all_poles:
             part = part_of(problem, box.each_delay[0][1]) or problem
             points += SumGrowth(part, box_of(part, delays)).points()

@@ -59,11 +59,13 @@ class Effort(NamedTuple):
     denser: int
     #: Greatest number of poles for which the whole range of the delay is searched.
     along_delay: float
+    #: Number of random starts, plus the same number for each pole.
+    random: int
 
 
 #: For one structure; and for a range of structures, where each has starts from many others.
-THOROUGH = Effort(24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, along_delay=np.inf)
-QUICK = Effort(12, 20, (0.03, 0.3), looked_at=1, refined=2, alone=3, denser=1, along_delay=2)
+THOROUGH = Effort(24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, along_delay=np.inf, random=2)
+QUICK = Effort(12, 20, (0.03, 0.3), looked_at=1, refined=2, alone=3, denser=1, along_delay=2, random=0)
 
 
 class StructureSearch:
@@ -73,16 +75,13 @@ class StructureSearch:
         self,
         problem: Problem,
         box: Box,
-        random_starts: int = 0,
-        seed: int = 0,
         *,
         effort: Effort = THOROUGH,
         known: KnownCoefficients = NOTHING,
         pilot: "StructureSearch | None" = None,
         first_delays: tuple[float, ...] | None = None,
     ) -> None:
-        self.problem, self.box, self.random_starts, self.seed = problem, box, random_starts, seed
-        self.effort = effort
+        self.problem, self.box, self.effort = problem, box, effort
         #: Known coefficients; with any, only the requested structure is searched.
         self.known = known
         #: Search of a part of the records, whose minima are starts.
@@ -233,7 +232,7 @@ class StructureSearch:
         if self._given_delays is not None or count < 2:
             return self._given_delays or self.box.middle
         apart = problem._replace(terms=(Term(1, 0, problem.integrators),) * count, inputs=tuple(range(count)))
-        return block_starts(apart, replace(self.box, parts=apart.parts), 0, self.seed)[0].seconds
+        return block_starts(apart, replace(self.box, parts=apart.parts), self.effort)[0].seconds
 
     def from_below(self, poles: int, zeros: int) -> list[Point]:
         """Return starts from smaller models and along the delay."""
@@ -366,8 +365,8 @@ class StructureSearch:
 
     def random_points(self, poles: int) -> list[Point]:
         """Return starts with uniformly distributed delays and logarithms of frequencies and dampings."""
-        rng, box, points = np.random.default_rng(self.seed), self.box, []
-        for _ in range(self.random_starts * (1 + poles)):
+        rng, box, points = np.random.default_rng(0), self.box, []
+        for _ in range(self.effort.random * (1 + poles)):
             roots = [self._random_poles(rng, order) for order in box.parts or (poles,)]
             delays = [float(rng.uniform(*pair)) for pair in box.each_delay]
             points.append(point_of(np.concatenate(roots), delays, box))
@@ -418,7 +417,7 @@ def with_added_poles(
 # --- several denominators: each is fitted to the residual of the others -------------------------------
 
 
-def block_starts(problem: Problem, box: Box, random_starts: int, seed: int) -> list[Point]:
+def block_starts(problem: Problem, box: Box, effort: Effort) -> list[Point]:
     """Return starts of a sum of fractions with several denominators, in order of ascending squared error.
 
     Each denominator is fitted to the output minus the current response of the others, in two sweeps in ascending and
@@ -431,7 +430,7 @@ def block_starts(problem: Problem, box: Box, random_starts: int, seed: int) -> l
         for block in (*order, *order):
             others = [part for other, part in parts.items() if other != block]
             own, own_box = _alone(problem, box, block, others)
-            searches[block] = search = StructureSearch(own, own_box, random_starts, seed)
+            searches[block] = search = StructureSearch(own, own_box, effort=effort)
             poles = problem.terms[block].poles
             search.climb(poles, own.zeros)
             search.refine(poles, own.zeros, search.resonances(poles, own.zeros))
