@@ -3,12 +3,12 @@
     python benchmarks/bench_search.py [--systems 300] [--seed 1] [--fixed] [--peer FILE]
 
 Systems of 1 to 4 poles and 0 to n - 1 zeros with a delay up to 15 s, searched from 0 to 20 s; 200 to 500 samples, two
-fifths of them on irregular clocks, 5 to 25 dB, inputs PRBS, Gaussian or multisine. ``DelayProfile`` with its defaults is
-compared with the peer of ``bench_known.py`` in the same box of admissible models: the best 40 of 200 random draws are
-refined, and so are the truth and the fit itself. The measure is ``N (S/S_min - 1)``: the excess of the squared error in
-units of the noise variance, of which 3.84 is the 95 % quantile for one parameter. Nothing excuses an excess, neither a
-status at a bound nor a refusal. ``--fixed``: one true coefficient is known. ``--peer`` keeps the least squared errors of
-the peer in a file, since they take most of the time.
+fifths of them on irregular clocks, 5 to 25 dB, inputs PRBS, Gaussian or multisine. ``DelayProfile`` with its defaults
+is compared with the peer of ``bench_known.py`` in the same box of admissible models: the best 40 of 200 random draws
+are refined, and so are the truth and the fit itself. The measure is ``N (S/S_min - 1)``: the excess of the squared
+error in units of the noise variance, of which 3.84 is the 95 % quantile for one parameter. Nothing excuses an excess,
+neither a status at a bound nor a refusal. ``--fixed``: one true coefficient is known. ``--peer`` keeps the least
+squared errors of the peer in a file, since they take most of the time.
 """
 
 import argparse
@@ -130,9 +130,8 @@ def main():
     for order, each in sorted(seconds.items()):
         print(f"{order} poles: {len(each)} systems, {sum(each):.1f} CPU s, greatest {max(each):.2f}")
     many = ", ".join(f"above {limit:g} in {sum(e > limit for e in excesses)}" for limit in (LITTLE, MUCH))
-    print(
-        f"{asked.systems} systems: excess {many}; in units of the noise variance; {sum(map(sum, seconds.values())):.0f} CPU s"
-    )
+    whole = sum(map(sum, seconds.values()))
+    print(f"{asked.systems} systems: excess {many}, in units of the noise variance; {whole:.0f} CPU s")
 
 
 if __name__ == "__main__":

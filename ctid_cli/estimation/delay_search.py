@@ -26,16 +26,8 @@ LEAST_CURVATURE = 1e-14
 LEAST_AT_BOUND = 1e-8
 #: Fewest delays of a grid over the whole range, for any bandwidth.
 FEWEST_DELAYS = 24
-#: Numbers of local minima of a level that the next level refines, and of the last level that are returned.
-KEPT = 8
+#: Number of local minima, of those compared with an estimate, that are refined.
 MINIMA = 3
-#: Half-width of the next level's search around each minimum, in grid spacings of the current level.
-REACH = 1.5
-#: Minima with a cost above the least of their level by more than this factor are discarded.
-HOPELESS = 4.0
-#: Final Gauss-Newton steps on the delay after the search on levels.
-DESCENT_ITERATIONS = 10
-DESCENT_TOLERANCE = 1e-4
 #: Largest number of delays compared with an estimate, and steps for refining the lowest minima among them.
 MOST_COMPARED = 400
 EFFORT = Steps(10, 1e-3, GUARDED)
@@ -66,11 +58,6 @@ class Minima(NamedTuple):
     thetas: Array
     #: Infinite if it could not be computed, shape (K,).
     squared_errors: Array
-
-    def lowest(self, most: int) -> list[Minimum]:
-        """Return the lowest local minima over ascending delays, lowest first."""
-        places = lowest_minima(self.squared_errors, most).tolist()
-        return [Minimum(self.thetas[k], float(self.squared_errors[k])) for k in places]
 
 
 def lowest_minima(costs: Array, most: int) -> IndexArray:
@@ -217,35 +204,6 @@ def quarter_periods(low: float, high: float, bandwidth: float, most: int) -> Arr
     return np.linspace(low, high, min(max(wanted, FEWEST_DELAYS), most))
 
 
-def search_levels(
-    costs: Sequence[DelayCost], spacings: Sequence[float], bounds: tuple[float, float]
-) -> tuple[Array, Array, list[Minimum]]:
-    """Search the whole range of the delay on levels, one for each cost with the spacing of its grid [s].
-
-    The spacing is at most a quarter period of the highest relevant frequency of the cost. At each delay the
-    coefficients start from those of both neighbours and from least squares, and the best are kept. Returns the grid of
-    the first level [s], its costs, NaN for singular equations, and the lowest minima of the last level.
-    """
-    low, high = bounds
-    grid = np.linspace(low, high, max(int(np.ceil((high - low) / spacings[0])) + 1, FEWEST_DELAYS))
-    first = found = scan([costs[0]] * grid.size, grid.tolist())
-    coarser = float(grid[1] - grid[0])
-    for level, spacing in enumerate(spacings[1:], 1):
-        count = int(np.ceil(REACH * coarser / spacing))
-        offsets = spacing * np.arange(-count, count + 1)
-        # Overlapping grids share their points.
-        places = {
-            round(float(minimum.delay + offset) / spacing) for minimum in _hopeful(found, KEPT) for offset in offsets
-        }
-        delays = np.unique(np.clip([place * spacing for place in sorted(places)], low, high))
-        found = scan([costs[level]] * delays.size, delays.tolist())
-        coarser = spacing
-    limits = Limits(low, high, DESCENT_ITERATIONS, DESCENT_TOLERANCE, SMALLEST_STEP * (high - low))
-    last = costs[-1]
-    ends = [descend(last, least.delay, least.theta[None], limits).minimum for least in _hopeful(found, MINIMA)]
-    return grid, first.squared_errors, sorted(ends, key=lambda end: end.squared_error)
-
-
 def scan(costs: Sequence[DelayCost], delays: Sequence[float], own: bool = True) -> Minima:
     """Return the least of each cost at its delay.
 
@@ -263,12 +221,6 @@ def scan(costs: Sequence[DelayCost], delays: Sequence[float], own: bool = True) 
                 found.thetas[k], found.squared_errors[k] = trial.theta, trial.squared_error
             neighbour = found.thetas[k : k + 1] if np.isfinite(found.squared_errors[k]) else neighbour[:0]
     return found
-
-
-def _hopeful(found: Minima, most: int) -> list[Minimum]:
-    """Return the lowest local minima, without those far above the least."""
-    lowest = found.lowest(most)
-    return [minimum for minimum in lowest if minimum.squared_error <= HOPELESS * lowest[0].squared_error]
 
 
 def lower_elsewhere(problem: SampledProblem, fit: Fit, bandwidth: float) -> bool:

@@ -49,8 +49,6 @@ class FilteredCost:
     #: Cut-off of the state-variable filter of the least-squares start [rad/s].
     svf_cutoff: float
     structure: Structure
-    #: Additional poles at the origin; with any the mean is omitted.
-    integrators: int
     #: Steps of the minimisation at each delay.
     steps: Steps
 
@@ -65,19 +63,19 @@ class FilteredCost:
 
         spectra, reach, steps = self.spectra, self.weights.size, self.steps
         data = spectra.frequencies[:reach], spectra.outputs[:reach], spectra.inputs(delay, reach), self.weights
-        poles, order = self.structure.poles, self.structure.poles + self.integrators
+        poles = self.structure.poles
         # B, and the terms of the states at the ends of the window.
-        linear = np.zeros(self.structure.zeros + 1 + order)
+        linear = np.zeros(self.structure.zeros + 1 + poles)
         tried = [np.concatenate((start[:poles], linear)) for start in starts]
         if own:
             # The state-variable filter 1/(p + w)^n; without poles np.poly returns a scalar.
             filter_ = np.concatenate((np.atleast_1d(np.poly(np.full(poles, -self.svf_cutoff)))[1:], linear))
-            solved, theta = least_squares(*data, filter_, poles, order)
+            solved, theta = least_squares(*data, filter_, poles)
             if solved:
                 tried.append(np.concatenate((reflect_unstable(np.append(1.0, theta[:poles]))[1:], linear)))
         best, effort = Minimum(np.zeros(self.size), np.inf), (steps.max_iterations, steps.tolerance, steps.halvings)
         for start in tried:
-            theta, squared_error, step = least_cost(*data, start, poles, order, *effort)
+            theta, squared_error, step = least_cost(*data, start, poles, *effort)
             if squared_error < best.squared_error:
                 best = Minimum(np.append(theta, delay), squared_error, step)
         return best
@@ -97,19 +95,16 @@ def filtered_costs(
     start: float,
     svf_cutoffs: Sequence[float],
     steps: Steps,
-    integrators: int = 0,
 ) -> list[FilteredCost]:
     """Return the costs of one record for several filters; samples until ``start`` after the first input are unused."""
     highest = HIGHEST * max(lowpass.cutoff for lowpass in lowpasses)
-    spectra = record_spectra(record, start, highest, greatest_delay, keep_mean=integrators == 0)
+    spectra = record_spectra(record, start, highest, greatest_delay)
     power = np.where(spectra.frequencies > 0.0, 2.0, 0.0) * np.abs(spectra.outputs) ** 2
     costs = []
     for lowpass, svf_cutoff in zip(lowpasses, svf_cutoffs, strict=True):
         weights = lowpass_weight(spectra.frequencies, lowpass)
         reach = int((weights >= NEGLIGIBLE_WEIGHT * weights.max()).sum())
-        costs.append(
-            FilteredCost(spectra, weights[:reach], float(weights @ power), svf_cutoff, structure, integrators, steps)
-        )
+        costs.append(FilteredCost(spectra, weights[:reach], float(weights @ power), svf_cutoff, structure, steps))
     return costs
 
 

@@ -153,14 +153,13 @@ def _moments(
     weights: Array,
     theta: Array,
     poles: int,
-    order: int,
 ) -> tuple[Array, float]:
     """Return products of the columns (dx/da, dx/db, dx/dT, dx/dtau, eps) at ``theta = (a, b, T)``, and output power.
 
-    ``order`` includes the integrators. If B is zero, dx/da uses the measured output, as least squares require.
+    If B is zero, dx/da uses the measured output, as least squares require.
     """
-    size, ahead = theta.size + 2, theta.size - order
-    denominator = np.zeros(order + 1)
+    size, ahead = theta.size + 2, theta.size - poles
+    denominator = np.empty(poles + 1)
     denominator[0] = 1.0
     for i in range(poles):
         denominator[i + 1] = theta[i]
@@ -168,7 +167,7 @@ def _moments(
     measured, power = True, 0.0
     for b in numerator:
         measured = measured and b == 0.0
-    rising, column = np.empty(order, np.complex128), np.empty(size, np.complex128)
+    rising, column = np.empty(poles, np.complex128), np.empty(size, np.complex128)
     columns = np.empty((2 * frequencies.size, size))
     for k in range(frequencies.size):
         jw = complex(0.0, frequencies[k])
@@ -182,15 +181,15 @@ def _moments(
         power += root * root * (output.real * output.real + output.imag * output.imag)
         # (jw)^i/A
         rising[0] = root * inverse
-        for i in range(1, order):
+        for i in range(1, poles):
             rising[i] = rising[i - 1] * jw
         filtered = outputs[k] if measured else output
         for i in range(poles):
-            column[i] = -rising[order - 1 - i] * filtered
+            column[i] = -rising[poles - 1 - i] * filtered
         for i in range(poles, ahead):
             column[i] = rising[ahead - 1 - i] * inputs[k]
-        for i in range(order):
-            column[ahead + i] = rising[order - 1 - i]
+        for i in range(poles):
+            column[ahead + i] = rising[poles - 1 - i]
         column[size - 2] = -root * jw * forced
         column[size - 1] = root * (outputs[k] - output)
         for i in range(size):
@@ -255,13 +254,12 @@ def least_squares(
     weights: Array,
     start: Array,
     poles: int,
-    order: int,
 ) -> tuple[bool, Array]:
     """Return the least-squares estimate of ``(a, b, T)`` with filter 1/F, ``start = (f_1 … f_n, 0 … 0)``.
 
     ``A Y = B U + T`` divided by F reads ``Y = -sum (a_i - f_i) (jw)^(n-i)/F Y + B/F U + T/F``.
     """
-    gram, _ = _moments(frequencies, outputs, inputs, weights, start, poles, order)
+    gram, _ = _moments(frequencies, outputs, inputs, weights, start, poles)
     solved, step = _solve(gram, start.size + 1, 0, start.size)
     return solved, start + step
 
@@ -274,7 +272,6 @@ def least_cost(
     weights: Array,
     start: Array,
     poles: int,
-    order: int,
     max_iterations: int,
     tolerance: float,
     halvings: int,
@@ -284,14 +281,14 @@ def least_cost(
     B and T are first fitted to the given a. A step to an unstable model, or one that does not lower the cost, is halved
     at most ``halvings`` times. The iteration ends when a step changes the model's output by less than the relative
     tolerance. Returns the coefficients, the squared error, infinite if the computation failed, and the Gauss-Newton
-    step of the delay [s], NaN if the data do not determine it. With integrators no frequency may be zero.
+    step of the delay [s], NaN if the data do not determine it.
     """
-    size, coefficients = start.size, start.size - order
-    gram, power = _moments(frequencies, outputs, inputs, weights, start, poles, order)
+    size, coefficients = start.size, start.size - poles
+    gram, power = _moments(frequencies, outputs, inputs, weights, start, poles)
     # The output is linear in B and T: one step from zero gives the minimum.
     solved, step = _solve(gram, size + 1, poles, size)
     theta = start + step
-    gram, power = _moments(frequencies, outputs, inputs, weights, theta, poles, order)
+    gram, power = _moments(frequencies, outputs, inputs, weights, theta, poles)
     if not (solved and math.isfinite(gram[-1, -1])):
         return theta[:coefficients], np.inf, np.nan
     for _ in range(max_iterations):
@@ -307,7 +304,7 @@ def least_cost(
         for _ in range(halvings):
             trial = theta + fraction * step
             if _is_stable(trial, poles):
-                tried, its_power = _moments(frequencies, outputs, inputs, weights, trial, poles, order)
+                tried, its_power = _moments(frequencies, outputs, inputs, weights, trial, poles)
                 bound = gram[-1, -1] - SUFFICIENT_FALL * 2.0 * fraction * slope
                 if tried[-1, -1] <= bound + ROUNDING * (power + its_power):
                     accepted = True

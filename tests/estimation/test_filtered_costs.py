@@ -28,9 +28,9 @@ THOROUGH = Steps(100, 1e-9, "guarded", 12)
 CUTOFFS = [0.3, 1.0, 2.02]
 
 
-def spectral_data(record, highest, delay, lowpass=None, keep_mean=True):
+def spectral_data(record, highest, delay, lowpass=None):
     """Return frequencies, output, delayed input and weights as arguments of the kernels."""
-    spectra = record_spectra(record, GREATEST, highest, GREATEST, keep_mean=keep_mean)
+    spectra = record_spectra(record, GREATEST, highest, GREATEST)
     return spectra.frequencies, spectra.outputs, spectra.inputs(delay), lowpass_weight(spectra.frequencies, lowpass)
 
 
@@ -62,7 +62,7 @@ def fitted(data, model, start, *, iterations=50, tolerance=1e-6):
     """Return the fit from a denominator, which is at the head of the parameters of a start."""
     n = model.order
     start = np.concatenate((start[:n], np.zeros(model.numerator.size + n)))
-    return least_cost(*data, start, n, n, iterations, tolerance, 12)
+    return least_cost(*data, start, n, iterations, tolerance, 12)
 
 
 def disturbed(model):
@@ -110,7 +110,7 @@ def test_with_fewer_bins_than_transient_coefficients_nothing_is_left():
     data = spectra.frequencies, spectra.outputs, spectra.inputs(1.0), np.ones(2)
     for order in (3, 5):
         _, squared_error, step = least_cost(
-            *data, np.append(np.poly(np.full(order, -1.0))[1:], np.zeros(1 + order)), order, order, 5, 1e-9, 12
+            *data, np.append(np.poly(np.full(order, -1.0))[1:], np.zeros(1 + order)), order, 5, 1e-9, 12
         )
         assert squared_error < 1e-12 * np.sum(np.abs(spectra.outputs) ** 2)
         assert np.isnan(step)
