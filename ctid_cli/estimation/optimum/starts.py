@@ -59,13 +59,15 @@ class Effort(NamedTuple):
     denser: int
     #: Greatest number of poles for which the whole range of the delay is searched.
     along_delay: float
+    #: Numbers of poles, those of the best starts, for which it is: of structures with up to two poles, and of others.
+    bases: tuple[int, int]
     #: Number of random starts, plus the same number for each pole.
     random: int
 
 
 #: For one structure; and for a range of structures, where each has starts from many others.
-THOROUGH = Effort(24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, along_delay=np.inf, random=2)
-QUICK = Effort(12, 20, (0.03, 0.3), looked_at=1, refined=2, alone=3, denser=1, along_delay=2, random=0)
+THOROUGH = Effort(24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, along_delay=np.inf, bases=(6, 1), random=2)
+QUICK = Effort(12, 20, (0.03, 0.3), looked_at=1, refined=2, alone=3, denser=1, along_delay=2, bases=(1, 1), random=0)
 
 
 class StructureSearch:
@@ -252,7 +254,9 @@ class StructureSearch:
                 others += self._grown(n, m, zeros, poles - n)
         descent = self.descent(zeros)
         points = descent.sorted(contained) + descent.sorted(others)[: self.effort.refined]
-        return self.along_delay(zeros, points) if poles <= self.effort.along_delay else points
+        if poles > self.effort.along_delay:
+            return points
+        return self.along_delay(zeros, points, self.effort.bases[poles > 2])
 
     def resonances(self, poles: int, zeros: int) -> list[Point]:
         """Return starts with a pair of the least damping, added to the poles of a smaller model.
@@ -339,15 +343,22 @@ class StructureSearch:
         dampings = effort.dampings if added == 2 else ()
         return with_added_poles(self.descent(zeros), box, (roots, delay), frequencies.tolist(), dampings, most)
 
-    def along_delay(self, zeros: int, points: list[Point]) -> list[Point]:
-        """Return the points, and starts at the minima of the profile over each delay for the poles of the best point.
+    def along_delay(self, zeros: int, points: list[Point], bases: int = 1) -> list[Point]:
+        """Return the points, and starts at the minima of the profile over the delay for the poles of the first points.
 
-        Several delays are optimised cyclically, twice.
+        Several delays are optimised cyclically, twice, for the poles of the best point.
         """
-        if not points:
+        free = self.box.free_delays
+        if not points or not free:
             return points
-        point, found, free = points[0], list[Point](), self.box.free_delays
-        for k in free if len(free) < 2 else (*free, *free):
+        if len(free) == 1:
+            seconds = [_at(points[0].seconds, free[0], tau) for tau in self.delays(MOST_DELAYS, free[0])]
+            trials = [[point_of(point.poles, each, self.box) for each in seconds] for point in points[:bases]]
+            errors = self.descent(zeros).squared_errors([trial for row in trials for trial in row])
+            rows = zip(trials, errors.reshape(len(trials), -1), strict=True)
+            return points + [row[i] for row, costs in rows for i in lowest_minima(costs, KEPT)]
+        point, found = points[0], list[Point]()
+        for k in (*free, *free):
             seconds = [_at(point.seconds, k, tau) for tau in self.delays(MOST_DELAYS, k)]
             trials = [point_of(point.poles, each, self.box) for each in seconds]
             minima = [trials[i] for i in lowest_minima(self.descent(zeros).squared_errors(trials), KEPT)]
