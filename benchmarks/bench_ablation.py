@@ -8,9 +8,8 @@ of problems that end above the least cost of all variants by more than a million
 saved without it. ``--costs`` keeps the least costs in a file, so that later runs with less code are compared with them.
 
 Random systems have a regular or an irregular clock, an input of random steps or of one narrow band, and a delay that is
-known, or searched within 12 or 100 sampling intervals. Three kinds of search alternate: with smaller models and random
-starts (``nested``, 1 to 3 poles), from the minima of the profile over the delay (``profile``, at rest, 1 to 6 poles),
-and as in the search for orders (``orders``, 1 to 6). A part is left out only where it applies, and problems to which
+known, or searched within 12 or 100 sampling intervals. Two kinds of search alternate: that of a fit (``fit``, 1 to 4
+poles), and the one for orders (``orders``, 1 to 6). A part is left out only where it applies, and problems to which
 none of the parts of ``--only`` applies are left out.
 ``--records`` adds measured records (see bench_optimum.py), ``--configs`` data sets of the useful-redundancy study.
 """
@@ -29,8 +28,6 @@ from bench_optimum import OTHERWISE, STRUCTURES, TREATMENTS, measured
 from scipy.optimize import least_squares
 
 from ctid_cli import DataError, DelayProfile, HeldSignal, Record, TransferFunction
-from ctid_cli.estimation import profile_search
-from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum import best_model, box, search, starts
 from ctid_cli.estimation.optimum.best_model import best_of_orders
 from ctid_cli.estimation.optimum.search import Descent
@@ -62,7 +59,7 @@ def random_poles(rng, count, slowest, fastest):
 
 def random_problem(rng, way):
     """Return an estimator and a record to fit."""
-    most = int(rng.integers(1, 4)) if way == "nested" else 6
+    most = int(rng.integers(1, 5)) if way == "fit" else 6
     n, samples, latest = int(rng.integers(1, most + 1)), int(rng.integers(200, 400)), int(rng.choice([0, 12, 100]))
     m = int(rng.integers(0, min(n, 4)))
     before = 100
@@ -79,12 +76,12 @@ def random_problem(rng, way):
         middle = np.exp(rng.uniform(np.log(0.05), np.log(1.0)))
         lines = middle * (1.0 + 0.1 * rng.uniform(-1.0, 1.0, 8))
         u = np.cos(np.outer(t, lines) + rng.uniform(0.0, 2.0 * np.pi, 8)).sum(axis=1)
-    state = "rest" if way == "profile" else str(rng.choice(["rest", "estimate"]))
+    state = str(rng.choice(["rest", "estimate"]))
     if state == "rest":
         t, u = t[:samples], u[:samples]
     x = simulate(model, HeldSignal(t, u), t)
     kept = slice(-samples, None)
-    offset = "estimate" if rng.random() < 0.3 and way != "profile" else "none"
+    offset = "estimate" if rng.random() < 0.3 else "none"
     noise = rng.standard_normal(samples) * x.std() * 10.0 ** (-rng.uniform(5.0, 35.0) / 20.0)
     y = x[kept] + noise + (offset == "estimate") * x.std()
     asked = int(np.clip(n + rng.choice([-1, 0, 0, 1]), 1, most))
@@ -101,7 +98,7 @@ def study_problems(count):
         estimator = next(cell.estimator for cell in plan.estimators if cell.name == "delay_profile")
         for cell in plan.data_cells:
             for k in range(count):
-                yield f"{name} {cell.swept['snr_db']} dB {k}", estimator, cell.dataset(k).record, "profile"
+                yield f"{name} {cell.swept['snr_db']} dB {k}", estimator, cell.dataset(k).record, "fit"
 
 
 def problems(asked):
@@ -113,10 +110,10 @@ def problems(asked):
         t, u, y = record.t[:MOST], record.input.values[:MOST], record.y[:MOST]
         for number, (n, m) in enumerate(STRUCTURES):
             options = DelayProfile(n, m, delays, initial_state=state, offset=offset, covariance="white")
-            way = ("nested", "nested", "orders", "orders")[number]
+            way = ("fit", "fit", "orders", "orders")[number]
             yield f"{name} {n}/{m}", options, Record.from_arrays(t, u, y), way
     for number in range(asked.systems):
-        way = ("nested", "profile", "orders")[number % 3]
+        way = ("fit", "orders")[number % 2]
         yield f"{asked.seed} {number}", *random_problem(np.random.default_rng([asked.seed, number]), way), way
 
 
@@ -126,7 +123,7 @@ def solved(options, record, way):
         problem = options.prepare(record).laid_out.problem
         searched = StructureSearch(problem, box.box_of(problem, options.delay_bounds), effort=QUICK)
         return best_of_orders(searched, options.poles, options.zeros).squared_error
-    fit = replace(options, nested=way == "nested").fit(record)
+    fit = options.fit(record)
     return fit.cost * fit.count
 
 
@@ -153,7 +150,7 @@ def without_edges():
     return [otherwise(module, "point_of", changed) for module in (box, best_model, search, starts)]
 
 
-def by_scipy(descent, start, known=(), near=search.NEAR, most_steps=search.MOST_STEPS):
+def by_scipy(descent, start, known=(), near=search.NEAR, most_steps=search.MOST_STEPS, to_end=False):
     """Refine by ``scipy.optimize.least_squares`` within the box of the logarithmic coordinates."""
     for _ in range(3):
         begin, seen = descent.local(start), {}
@@ -215,11 +212,11 @@ def variants():
         "poles added": (set(), [patch.object(StructureSearch, "_grown", nothing)]),
         "delays of the best start": (
             {"delay"},
-            [patch.object(StructureSearch, "along_delay", lambda _, __, points: points)],
+            [patch.object(StructureSearch, "along_delay", lambda _, __, points, *___: points)],
         ),
-        "resonances": ({"nested"}, [patch.object(StructureSearch, "resonances", nothing)]),
-        "close delays": ({"nested", "delay", "irregular"}, [patch.object(StructureSearch, "close_delays", nothing)]),
-        "cells beside": ({"delay", "regular"}, [patch.object(StructureSearch, "_beside", nothing)]),
+        "resonances": ({"fit"}, [patch.object(StructureSearch, "resonances", nothing)]),
+        "close delays": ({"fit", "delay", "irregular"}, [patch.object(StructureSearch, "close_delays", nothing)]),
+        "cells beside": ({"delay", "regular"}, [patch.object(StructureSearch, "_in_adjacent_cells", nothing)]),
         "random points": (set(), [patch.object(StructureSearch, "random_points", nothing)]),
         "fewer poles": (
             set(),
@@ -227,23 +224,11 @@ def variants():
         ),
         "coordinates at Nyquist": ({"regular"}, without_edges()),
         "stop where hopeless": (set(), [patch.object(search, "_hopeless", lambda *_: False)]),
-        "stop at known minima": (set(), [patch.object(search, "_alike", lambda *_: False)]),
+        "stop at known minima": (set(), [patch.object(search, "_close", lambda *_: False)]),
         "other side of a sample": ({"delay", "regular"}, [patch.object(Descent, "_faced", lambda _, here: here)]),
         "steps to a sample": (
             {"delay", "regular"},
             [patch.object(Descent, "_whole_and_to_edge", lambda _, __, step: [step])],
-        ),
-        "filtered levels": (
-            {"delay", "filters"},
-            [patch.object(profile_search, "_search_levels", lambda _: ([], None))],
-        ),
-        "fine grid of delays": (
-            {"delay", "filters"},
-            [patch.object(profile_search, "_local_grid", lambda _, centres, __, ___, most: list(centres)[:most])],
-        ),
-        "profile where nested": (
-            {"nested"},
-            [otherwise(MeasuredRecords, "best", lambda f, s, a, nested: f(s, [] if nested else a, nested))],
         ),
         "our descent (SciPy's instead)": (set(), [patch.object(Descent, "descend", by_scipy)]),
     }
@@ -253,8 +238,7 @@ def properties(options, record, way):
     """Return the properties of a problem to which some parts apply."""
     has = {way, "regular" if record.interval else "irregular"}
     low, high = options.delay_bounds
-    filtered = options.initial_state == "rest" and options.offset != "estimate" and way != "orders"
-    return has | ({"delay"} if low < high else set()) | ({"filters"} if filtered else set())
+    return has | ({"delay"} if low < high else set())
 
 
 def main():
@@ -298,12 +282,10 @@ def main():
             print(
                 f"{name} {way} {options.poles}/{options.zeros} {options.delay_bounds}: {'; '.join(above)}", flush=True
             )
-    print(
-        "| without | problems | above the optimum (nested, profile, orders) | CPU s | with all |\n|---|--:|--:|--:|--:|"
-    )
+    print("| without | problems | above the optimum (fit, orders) | CPU s | with all |\n|---|--:|--:|--:|--:|")
     for variant, seconds in spent.items():
         above = [name for name, each in costs.items() if each.get(variant, 0.0) > known[name] * (1 + TOLERANCE)]
-        split = ", ".join(str(sum(ways[name] == way for name in above)) for way in ("nested", "profile", "orders"))
+        split = ", ".join(str(sum(ways[name] == way for name in above)) for way in ("fit", "orders"))
         met = [name for name, each in costs.items() if variant in each]
         whole = sum(times[name] for name in met)
         print(f"| {variant} | {len(met)} | {len(above)} ({split}) | {seconds:.1f} | {whole:.1f} |")

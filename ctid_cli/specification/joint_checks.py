@@ -43,6 +43,8 @@ MAX_TRIALS = 64
 TIME_CONSTANTS = 3.0
 #: Input edges within this fraction of the sampling interval of a sample count as simultaneous with it.
 ON_TIME = 1e-6
+#: Warning about an option without an effect.
+FORMER = "is an option of earlier versions and has no effect; only estimates stored with it are still found by it"
 #: Success rules of systems and of signals.
 _RULES_OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
 _RULES_OF_SIGNALS = ("band", "by", "window")
@@ -439,7 +441,7 @@ def joint_warnings(spec: Spec) -> list[Violation]:
         for option, (_, default) in former_options(section.target).items():
             if getattr(section, option) != default:
                 place = ("estimators", name, option)
-                warnings.append((place, "has no effect: every search has all starts; leave it out"))
+                warnings.append((place, FORMER))
     if spec.starts is not None:
         first = [sweeps.variants(section)[0].options for section in spec.estimators.values()]
         taken = {getattr(options, "start_from", None) for options in first}

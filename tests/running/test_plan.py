@@ -156,3 +156,33 @@ def test_what_a_data_cell_is_made_of(plan_of):
     assert plan.data_cells[0].hash == "b3133309744adf43"
     assert plan.estimators[1].content["kind"] == "srivc"
     assert plan.estimators[1].hash == content_hash(plan.estimators[1].content)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, "a3e88a84b64c7e4b"),
+        ({"nested": True}, "552743275c51f69f"),
+        ({"zeros": 0, "fixed": [{"name": "a1", "value": 2.0}]}, "8f2cabde5359f0f1"),
+        ({"poles": 1, "delay_bounds": [0.3, 0.3], "svf_cutoff": 2.0}, "f3207ed1a9f462e8"),
+        ({"inputs": [{"name": "u1", "zeros": 0}]}, "32d0dca1b04ae60f"),
+    ],
+    ids=["defaults", "nested", "fixed", "known delay", "several inputs"],
+)
+def test_estimators_keep_the_hashes_of_earlier_versions(options, expected):
+    estimator = {"kind": "delay_profile", "poles": 2, "zeros": 1, "delay_bounds": [0, 1]} | options
+    content = {
+        "experiment": "hashes",
+        "system": {"numerator": [2.0], "denominator": [1.0, 1.0], "delay": 0.3},
+        "excitation": {"kind": "prbs", "stages": 7, "clock_period": 0.5},
+        "sampling": {"kind": "regular", "interval": 0.1, "samples": 400},
+        "estimators": {"one": estimator},
+        "monte_carlo": {"runs": 1, "seed": 1},
+    }
+    if "inputs" in options:
+        one = {"system": content.pop("system"), "excitation": content.pop("excitation")}
+        content["inputs"] = {"u1": one, "u2": one}
+    spec = load_spec(content)
+    assert [cell.hash for cell in build_plan(spec).estimators] == [expected]
+    former = {"nested", "svf_cutoff"} & options.keys()
+    assert [warning.split(": ", 2)[1] for warning in spec.warnings] == [f"estimators.one.{name}" for name in former]

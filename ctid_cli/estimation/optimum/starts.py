@@ -66,7 +66,9 @@ class Effort(NamedTuple):
 
 
 #: For one structure; and for a range of structures, where each has starts from many others.
-THOROUGH = Effort(24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, along_delay=np.inf, bases=(6, 1), random=2)
+THOROUGH = Effort(
+    24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, along_delay=np.inf, bases=(6, 1), random=2
+)
 QUICK = Effort(12, 20, (0.03, 0.3), looked_at=1, refined=2, alone=3, denser=1, along_delay=2, bases=(1, 1), random=0)
 
 
