@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ctid_cli.estimation.optimum.best_model import best_output_error
+from ctid_cli.estimation.optimum.best_model import best_local, best_output_error
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
@@ -48,8 +48,13 @@ def problem_of(records, zeros, *, free_response=False, offset=False, periods=Non
     return Problem(tuple(records), zeros, free_response, (0,) * offset, periods, integrators=integrators)
 
 
-def best(records, poles, zeros, *, delays=(0.0, 0.0), starts=(), **options):
+def best(records, poles, zeros, *, delays=(0.0, 0.0), starts=(), search=best_output_error, **options):
     """Return the minimum output error of records."""
     names = "free_response", "offset", "periods", "integrators"
     problem = problem_of(records, zeros, **{name: options.pop(name) for name in names if name in options})
-    return best_output_error(problem, poles, delays, starts, **options)
+    return search(problem, poles, delays, starts, **options)
+
+
+def nearest(records, poles, zeros, **options):
+    """Return the minimum output error in the basins of starts."""
+    return best(records, poles, zeros, search=best_local, **options)

@@ -113,7 +113,7 @@ def test_the_end_of_a_search_is_stationary_along_the_constraint():
     data = filter_data(record_of(model, rng, noise=0.2))
     values = {1: 1.2 * model.denominator[2], 4: 0.8 * model.numerator[0]}
     known = KnownCoefficients.of(4, 1, values)
-    found = best([data], 4, 1, delays=(0.0, 3.0), known=known, random_starts=0)
+    found = best([data], 4, 1, delays=(0.0, 3.0), known=known)
     assert found.ending is Ending.CONVERGED
     assert (found.denominator[2], found.numerator[0]) == (values[1], values[4])
     box = found.box
