@@ -164,7 +164,7 @@ def best_output_error(
             return found
     search = StructureSearch(problem, box)
     search.climb(poles, zeros)
-    search.refine(poles, zeros, points + search.resonances(poles, zeros))
+    search.refine(poles, zeros, points + search.resonances(poles, zeros), slow_too=True)
     search.refine(poles, zeros, search.close_delays(poles, zeros))
     return _with_others(_least(search, poles, zeros, True), search, poles, zeros)
 
@@ -206,7 +206,7 @@ def _with_known(free: StructureSearch, poles: int, points: list[Point], known: K
         points += [local.point for local in free.minima(poles, zeros)] + free.from_below(poles, zeros)
         points += free.resonances(poles, zeros) + free.random_points(poles)
     points = search.descent(zeros).sorted(_met(points, box, known))
-    search.refine(poles, zeros, search.along_delay(zeros, points))
+    search.refine(poles, zeros, search.along_delay(zeros, points), slow_too=True)
     search.refine(poles, zeros, search.close_delays(poles, zeros))
     return search
 

@@ -149,8 +149,11 @@ class StructureSearch:
             minima[0] = self.descent(zeros).settle(minima[0])
         return minima[0]
 
-    def refine(self, poles: int, zeros: int, points: Iterable[Point]) -> None:
-        """Search from points, then in delay cells adjacent to that of the best minimum; keep the lowest minima."""
+    def refine(self, poles: int, zeros: int, points: Iterable[Point], *, slow_too: bool = False) -> None:
+        """Search from points, then in delay cells adjacent to that of the best minimum; keep the lowest minima.
+
+        The adjacent cells are searched if there is a fast pole, with ``slow_too`` always.
+        """
         descent, kept = self.descent(zeros), self._competing.setdefault((poles, zeros), [])
         ends = self._ends.setdefault((poles, zeros), [])
         queue, cells = list(points), set[tuple[int, int]]()
@@ -161,7 +164,7 @@ class StructureSearch:
             kept.append(local)
             if not queue:
                 lowest = min(kept, key=lambda local: local.squared_error)
-                queue = self._in_adjacent_cells(lowest.point, cells)
+                queue = self._in_adjacent_cells(lowest.point, cells, slow_too)
         kept.sort(key=lambda local: local.squared_error)
         distinct: list[Local] = []
         for local in kept:
@@ -205,14 +208,15 @@ class StructureSearch:
         delay = self.best(1, 0).seconds if poles > 1 else self.first_delays
         return self._extended(zeros, np.zeros(0, dtype=complex), delay, poles, self.effort.alone, self.effort.denser)
 
-    def _in_adjacent_cells(self, point: Point, cells: set[tuple[int, int]]) -> list[Point]:
+    def _in_adjacent_cells(self, point: Point, cells: set[tuple[int, int]], slow_too: bool) -> list[Point]:
         """Return starts in the delay cells adjacent to that of a minimum, except ``cells`` already visited.
 
         With a fast pole the cost is smooth only within each cell, and a minimum in one does not determine the next.
-        With several inputs this was observed with slow poles too.
+        With slow poles this is rare.
         """
         width, points = self.box.cell, list[Point]()
-        slow = not self.box.several_delays and float(point.speed.max(initial=0.0)) * width < FAST
+        slow_too = slow_too or self.box.several_delays
+        slow = not slow_too and float(point.speed.max(initial=0.0)) * width < FAST
         if not width or not point.speed.size or slow:
             return []
         for k in self.box.free_delays:
