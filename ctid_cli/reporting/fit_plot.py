@@ -1,4 +1,4 @@
-"""Figure of ``ctid fit``: output, residuals, their correlation, and the search over the delay."""
+"""Figure of ``ctid fit``: output, residuals, their correlation, and the cost over the delay."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class FitFigures:
         return min(len(self.measurements), MOST_DRAWN)
 
     def all(self) -> Drawing:
-        """Draw output and residuals of each experiment, autocorrelation, and the search over the delay."""
+        """Draw output and residuals of each experiment, autocorrelation, and the cost over the delay."""
         n = self.drawn
 
         def draw(figure: Figure) -> None:

@@ -118,7 +118,7 @@ class FitResult(PagedResult):
         return Table.of_rows(parameter_rows(parameters_of(self.fitted, self.units)), is_named=True)
 
     def drawing(self) -> Drawing:
-        """Return the figure of output, residuals, their correlation, and the search over the delay."""
+        """Return the figure of output, residuals, their correlation, and the cost over the delay."""
         several = isinstance(self.fitted.fit, MultiInputFit)
         return inputs_drawing(self.figures) if several else self.figures.all()
 
