@@ -67,7 +67,7 @@ class Effort(NamedTuple):
 
 #: For one structure; and for a range of structures, where each has starts from many others.
 THOROUGH = Effort(
-    24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, along_delay=np.inf, bases=(6, 1), random=2
+    24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, along_delay=np.inf, bases=(4, 1), random=2
 )
 QUICK = Effort(12, 20, (0.03, 0.3), looked_at=1, refined=2, alone=3, denser=1, along_delay=2, bases=(1, 1), random=0)
 
@@ -359,9 +359,9 @@ class StructureSearch:
             return points
         if len(free) == 1:
             seconds = [_at(points[0].seconds, free[0], tau) for tau in self.delays(MOST_DELAYS, free[0])]
-            trials = [[point_of(point.poles, each, self.box) for each in seconds] for point in points[:bases]]
-            errors = self.descent(zeros).squared_errors([trial for row in trials for trial in row])
-            rows = zip(trials, errors.reshape(len(trials), -1), strict=True)
+            tried = [[point_of(base.poles, each, self.box) for each in seconds] for base in points[:bases]]
+            errors = self.descent(zeros).squared_errors([trial for row in tried for trial in row])
+            rows = zip(tried, errors.reshape(len(tried), -1), strict=True)
             return points + [row[i] for row, costs in rows for i in lowest_minima(costs, KEPT)]
         point, found = points[0], list[Point]()
         for k in (*free, *free):
