@@ -428,12 +428,14 @@ class Profile(NamedTuple):
 
 
 def profile_of_delay(result: Identification) -> Profile | None:
-    """Return the cost over the range of the delay; None for a known delay, several inputs, a sum or a loop.
+    """Return the cost over the range of the delay; None if it is known, and for several inputs, sums, loops, spectra.
 
     The spacing is a quarter period of the bandwidth of the output, unless these are too many delays. At each one the
     descent starts from the poles at the next one, towards that of the estimate.
     """
-    laid_out = None if isinstance(result.fit, MultiInputFit) else result.options.prepare(result.records).laid_out
+    if isinstance(result.fit, MultiInputFit) or not result.records:
+        return None
+    laid_out = result.options.prepare(result.records).laid_out
     if not isinstance(laid_out, MeasuredRecords) or laid_out.problem.terms or "delay" not in result.fit.parameter_names:
         return None
     ((low, high),) = each_bounds(laid_out.treatment.delay_bounds)
