@@ -67,7 +67,7 @@ class Effort(NamedTuple):
 
 #: For one structure; and for a range of structures, where each has starts from many others.
 THOROUGH = Effort(
-    24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, along_delay=np.inf, bases=(4, 1), random=2
+    24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, along_delay=np.inf, bases=(6, 1), random=2
 )
 QUICK = Effort(12, 20, (0.03, 0.3), looked_at=1, refined=2, alone=3, denser=1, along_delay=2, bases=(1, 1), random=0)
 
@@ -262,7 +262,10 @@ class StructureSearch:
         points = descent.sorted(contained) + descent.sorted(others)[: self.effort.refined]
         if poles > self.effort.along_delay:
             return points
-        return self.along_delay(zeros, points, self.effort.bases[poles > 2])
+        extended = self.along_delay(zeros, points, self.effort.bases[poles > 2])
+        # Single poles at the first delay, which no model has determined, only lead to the others.
+        undetermined = (poles, zeros) == (1, 0) and self.effort is THOROUGH and len(extended) > len(points)
+        return extended[len(points) :] if undetermined else extended
 
     def resonances(self, poles: int, zeros: int) -> list[Point]:
         """Return starts with a pair of the least damping, added to the poles of a smaller model.
@@ -362,8 +365,11 @@ class StructureSearch:
             tried = [[point_of(base.poles, each, self.box) for each in seconds] for base in points[:bases]]
             errors = self.descent(zeros).squared_errors([trial for row in tried for trial in row])
             rows = zip(tried, errors.reshape(len(tried), -1), strict=True)
-            return points + [row[i] for row, costs in rows for i in lowest_minima(costs, KEPT)]
-        point, found = points[0], list[Point]()
+            lowest = [(float(costs[i]), row[i]) for row, costs in rows for i in lowest_minima(costs, KEPT)]
+            # The lowest first: many of the other searches then end early.
+            found = [trial for _, trial in sorted(lowest, key=lambda pair: pair[0])]
+            return points + found
+        point, found = points[0], []
         for k in (*free, *free):
             seconds = [_at(point.seconds, k, tau) for tau in self.delays(MOST_DELAYS, k)]
             trials = [point_of(point.poles, each, self.box) for each in seconds]
