@@ -1,0 +1,447 @@
+"""Simulated records of kinds in which printed intervals are easily wrong, with the accuracy that they allow.
+
+The makers take all properties but the noise; the kinds draw these and the options of the fits.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.linalg import toeplitz
+from scipy.signal import lfilter
+
+from ctid_cli import (
+    DelayProfile,
+    Fixed,
+    FrequencyData,
+    FrequencyDomain,
+    Given,
+    HeldSignal,
+    InputModel,
+    Record,
+    TransferFunction,
+    simulate,
+)
+
+# --- cases ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Data with their true models by input, and the 95 % half-widths of their quantities; "" is a single input."""
+
+    data: object
+    systems: dict
+    half_widths: dict
+    #: Names of the inputs that repeat, so that other gains and delays are equivalent.
+    repeats: tuple = ()
+    #: Options by the names of their rows.
+    variants: dict = field(default_factory=dict)
+
+    def fitted_with(self, **variants):
+        return replace(self, variants=variants)
+
+
+def first_order(gain, time_constant, delay=0.0):
+    return TransferFunction([gain], [time_constant, 1.0], delay)
+
+
+def square(k, half, low=-1.0, high=1.0):
+    """Return a square wave of given half period [samples] that begins with the high level at sample 0."""
+    return np.where(k // half % 2 == 0, high, low)
+
+
+def binary(rng, n, held):
+    """Return a random binary signal, constant for a number of samples."""
+    return np.repeat(rng.choice([-1.0, 1.0], n // held + 1), held)[:n]
+
+
+def irregular(rng, n, interval=1.0):
+    return interval * np.append(0.0, np.cumsum(rng.uniform(0.5, 1.5, n - 1)))
+
+
+def coloured_noise(rng, n, pole=0.0):
+    """Return AR(1) noise of deviation 1, after its transient."""
+    return lfilter([1.0], [1.0, -pole], np.sqrt(1 - pole**2) * rng.standard_normal(n + 200))[200:]
+
+
+def packed(systems):
+    """Return the parameters of models: numerator, denominator and delay of each."""
+    return np.concatenate([np.r_[each.numerator, each.denominator[1:], each.delay] for each in systems.values()])
+
+
+def unpacked(theta, like):
+    """Return numerator, denominator and delay by input."""
+    found, rest = {}, theta
+    for name, each in like.items():
+        b, size = each.numerator.size, each.numerator.size + each.order + 1
+        found[name], rest = (rest[:b], np.r_[1.0, rest[b : size - 1]], rest[size - 1]), rest[size:]
+    return found
+
+
+def quantities(parts):
+    """Return static gain, delay, time constants, natural frequencies and damping under their printed names."""
+    found = {}
+    for name, (b, a, delay) in parts.items():
+        prefix = f"{name}_" if name else ""
+        found |= {f"{prefix}static_gain": b[-1] / a[-1], f"{prefix}delay": delay}
+        poles = np.roots(a)
+        upper = sorted((pole for pole in poles if pole.imag >= 0), key=abs, reverse=True)
+        for k, pole in enumerate(upper, 1):
+            if pole.imag:
+                found |= {f"{prefix}natural_frequency_{k}": abs(pole), f"{prefix}damping_{k}": -pole.real / abs(pole)}
+            else:
+                found[f"{prefix}time_constant_{k}"] = -1.0 / pole.real
+        if a.size == 3:  # a pair may be printed for two real poles
+            found |= {f"{prefix}natural_frequency_1": a[2] ** 0.5, f"{prefix}damping_1": 0.5 * a[1] * a[2] ** -0.5}
+    return found
+
+
+def differences(function, systems, interval):
+    """Return the derivatives of a function by the parameters of the models, by central differences."""
+    theta, columns = packed(systems), []
+    delays = np.cumsum([each.numerator.size + each.order + 1 for each in systems.values()]) - 1
+    for k in range(theta.size):
+        step = np.zeros(theta.size)
+        step[k] = 1e-4 * interval if k in delays else 1e-6 * abs(theta[k])
+        columns.append((function(theta + step) - function(theta - step)) / (2 * step[k]))
+    return np.column_stack(columns)
+
+
+def half_widths(systems, psi, noise):
+    """Return 95 % half-widths of all quantities by least squares, linear about the true models, for the true noise."""
+    scale = np.maximum(np.linalg.norm(psi, axis=0), 1e-300)
+    left, size, right = np.linalg.svd(psi / scale, full_matrices=False)
+    inverse = (right.T / np.maximum(size, 1e-9 * size[0])) @ left.T
+    count = packed(systems).size
+    covariance = (inverse @ noise @ inverse.T)[:count, :count] / np.outer(scale[:count], scale[:count])
+    names = list(quantities(unpacked(packed(systems), systems)))
+
+    def values(theta):
+        return np.array([*quantities(unpacked(theta, systems)).values()])
+
+    gradient = differences(values, systems, 1.0)
+    errors = np.sqrt(np.maximum(np.einsum("ik,kl,il->i", gradient, covariance, gradient), 0.0))
+    return dict(zip(names, 1.96 * errors, strict=True))
+
+
+# --- makers --------------------------------------------------------------------------------------------
+
+
+def simulated(
+    rng, systems, t, inputs, *, first=0, moving=False, repeats=(), db=20.0, colour=0.0, offset=0.0, drift=0.0, plus=0.0
+):
+    """Return the case of a record that begins with sample ``first`` of a simulation from rest.
+
+    Offset and drift are relative to the deviation of the response; ``plus`` is a part of it outside the model. If the
+    system is moving at the beginning of the record, the bounds include an estimated state and leave out the samples
+    before the delay, whose input is not recorded.
+    """
+    systems = systems if isinstance(systems, dict) else {"": systems}
+    inputs = inputs if isinstance(inputs, dict) else {"": inputs}
+    signals, own = {name: HeldSignal(t, u) for name, u in inputs.items()}, t[first:]
+
+    def output(theta):
+        parts = unpacked(theta, systems)
+        return sum(simulate(TransferFunction(b, a), signals[name], own - tau) for name, (b, a, tau) in parts.items())
+
+    x = output(packed(systems)) + plus
+    ramp = (own - own[0]) / (own[-1] - own[0])
+    deviation = 10 ** (-db / 20) * x.std()
+    y = x + (offset + drift * ramp) * x.std() + deviation * coloured_noise(rng, own.size, colour)
+    held = {name: HeldSignal(own, u[first:]) for name, u in inputs.items()}
+    extra, used = [np.ones(own.size)] + [ramp] * bool(drift), np.ones(own.size, dtype=bool)
+    if moving:
+        used = own >= own[0] + max(each.delay for each in systems.values())
+        for pole in (pole for each in systems.values() for pole in each.poles if pole.imag >= 0):
+            free = np.exp(pole * (own - own[0]))
+            extra += [free.real] + [free.imag] * bool(pole.imag)
+    psi = np.column_stack([differences(output, systems, np.diff(own).min()), *extra])[used]
+    noise = deviation**2 * toeplitz(colour ** np.arange(used.sum()))
+    return Case(Record(own, y, held.get("", held)), systems, half_widths(systems, psi, noise), repeats)
+
+
+def square_record(rng, system, n, half, start="cut", low=-1.0, wait=0, interval=0.1, **noise):
+    """Return a square wave of given half period [samples].
+
+    The record is cut from a long one after ``wait`` samples (start "cut"), begins at rest with the wave ("rest"), or
+    has the low level before the wave, in the record for ``wait`` samples ("quiet").
+    """
+    first = {"cut": 20 * half + wait, "rest": 0, "quiet": 20 * half}[start]
+    k = np.arange(-first, n)
+    u = square(k - wait * (start == "quiet"), half, low)
+    if start == "quiet":
+        u[: first + wait] = low
+    cut = start == "cut"
+    return simulated(rng, system, interval * k, u, first=first, moving=cut, repeats=("",) * cut, **noise)
+
+
+def periodic_record(rng, system, n, period, first=0, known=False, **noise):
+    """Return an input of whole periods, given by its samples; the first samples are cut off.
+
+    With a known state, as in a whole number of periods, the delays are taken as known within one period.
+    """
+    t = np.arange(-float(first), n)
+    u = np.resize(period, t.size)
+    cut = first > 0 and not known
+    return simulated(rng, system, t, u, first=first, moving=cut, repeats=("",) * cut, **noise)
+
+
+def sine_record(rng, system, n, period, **noise):
+    """Return a sine of given period [s] in the steady state, at intervals of 1 s."""
+    t = np.arange(-400.0, n)
+    return simulated(rng, system, t, np.sin(2 * np.pi * t / period), first=400, moving=True, **noise)
+
+
+def step_record(rng, system, n, start, size=1.0, interval=1.0, bend=0.0, **noise):
+    """Return one step after rest at a sample; the time constant of a first-order system may vary with the response.
+
+    With a response from 0 to 1 it is ``T (1 + bend z)`` at z; then there are no true poles.
+    """
+    t, plus = interval * np.arange(n), 0.0
+    u = size * (np.arange(n) >= start)
+    if bend:
+        s, last = np.linspace(0.0, 60.0, 60_001), 1.0 - np.exp(-np.linspace(0.0, 60.0, 60_001))
+        since = np.maximum(t - t[start], 0.0) * system.denominator[1]
+        bent, straight = np.interp(since, s + bend * (s - last), last), 1.0 - np.exp(-since)
+        plus = system.dc_gain * size * (bent - straight)
+    case = simulated(rng, system, t, u, plus=plus, **noise)
+    return replace(case, half_widths={"static_gain": case.half_widths["static_gain"]}) if bend else case
+
+
+def binary_record(rng, system, t, held, quiet=0, steps=False, **noise):
+    """Return a random binary signal, or random steps, constant for some samples, after zero for some samples."""
+    u = binary(rng, t.size, held) * (np.repeat(rng.uniform(0.3, 2.0, t.size), held)[: t.size] if steps else 1.0)
+    return simulated(rng, system, t, np.where(np.arange(t.size) < quiet, 0.0, u), **noise)
+
+
+def two_input_record(rng, systems, n, half, held, **noise):
+    """Return a square wave u1 of given half period and a random binary signal u2, cut from a long record."""
+    first = 20 * half
+    k = np.arange(-first, n)
+    inputs = {"u1": square(k, half), "u2": binary(rng, k.size, held)}
+    return simulated(rng, systems, 1.0 * k, inputs, first=first, moving=True, repeats=("u1",), **noise)
+
+
+def measured_response(rng, system, frequencies, db=30.0, known=True):
+    """Return a frequency response with errors of one deviation, which is known or not."""
+    s, count = 1j * frequencies, frequencies.size
+
+    def output(theta):
+        b, a, tau = unpacked(theta, {"": system})[""]
+        values = np.polyval(b, s) / np.polyval(a, s) * np.exp(-s * tau)
+        return np.r_[values.real, values.imag]
+
+    x = output(packed({"": system}))
+    deviation = 10 ** (-db / 20) * np.sqrt(np.mean(x**2))
+    y = x + deviation * rng.standard_normal(2 * count)
+    errors = np.full(count, np.sqrt(2.0) * deviation) if known else None
+    psi = differences(output, {"": system}, 1.0 / frequencies[-1])
+    widths = half_widths({"": system}, psi, deviation**2 * np.eye(2 * count))
+    return Case(FrequencyData(frequencies, y[:count] + 1j * y[count:], errors), {"": system}, widths)
+
+
+# --- kinds ---------------------------------------------------------------------------------------------
+
+
+def drawn_gain(rng):
+    return rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 4.0)
+
+
+def drawn_system(rng, poles, slowest, delay, zeros=0):
+    """Return a random system with its slowest time constant given [s]."""
+    roots, speed = [], 1 / slowest
+    while len(roots) < poles:
+        if poles - len(roots) > 1 and rng.random() < 0.4:
+            damping = rng.uniform(0.2, 0.9)
+            pair = speed * complex(-damping, np.sqrt(1 - damping**2))
+            roots += [pair, pair.conjugate()]
+        else:
+            roots.append(-speed)
+        speed *= rng.uniform(1.6, 5.0)
+    a = np.poly(roots).real
+    b = np.atleast_1d(np.poly(rng.choice([-1.0, -1.0, 1.0], zeros) * rng.uniform(0.5, 4.0, zeros) / slowest))
+    return TransferFunction(b * drawn_gain(rng) * a[-1] / b[-1], a, delay)
+
+
+def drawn_noise(rng):
+    return {"db": rng.uniform(10, 30), "offset": rng.choice([0.0, rng.uniform(-3.0, 3.0)])}
+
+
+def square_wave(rng, number):
+    half, n, poles = int(rng.integers(8, 31)), int(rng.integers(150, 401)), int(rng.integers(1, 3))
+    start = ("cut", "rest", "quiet")[number % 3]
+    system = drawn_system(rng, poles, 0.1 * half * rng.uniform(0.1, 1.0), 0.1 * half * rng.uniform(0.0, 1.9))
+    wave = {"start": start, "low": rng.choice([-1.0, 0.0]), "wait": int(rng.integers(5, 2 * half))}
+    reach = (0.0, 0.3 * half)
+    state = {"cut": {"initial_state": "estimate"}, "rest": {}, "quiet": {"input_before": "first"}}[start]
+    variants = {
+        "typed": Given(poles=poles, zeros=0),
+        "range": Given(poles=poles, zeros=0, delay_bounds=reach),
+        "class": DelayProfile(poles, 0, reach, offset="estimate", **state),
+        "chosen": Given(),
+    }
+    case = square_record(rng, system, n, half, **wave, **drawn_noise(rng))
+    return case.fitted_with(**{f"{start}, {name}": options for name, options in variants.items()})
+
+
+def whole_periods(rng, number):
+    start = ("cut", "rest", "whole")[number % 3]
+    once = start == "whole" and rng.random() < 0.5
+    size, poles = int(rng.integers(*((150, 301) if once else (30, 61)))), int(rng.integers(1, 3))
+    system = drawn_system(rng, poles, size * rng.uniform(0.05, 0.3), size * rng.uniform(0.0, 0.85))
+    waves, k = np.arange(1, size // 2), np.arange(size)
+    period = (
+        binary(rng, size, 3),
+        np.cos(2 * np.pi * np.outer(k, waves) / size + rng.uniform(0, 2 * np.pi, waves.size)).sum(axis=1),
+        1.0 * (k < rng.integers(size // 10, size // 3)),
+    )[int(rng.integers(3))]
+    n = size if once else size * int(rng.integers(3, 7)) + int(rng.integers(size)) * (start != "whole")
+    first = 0 if start == "rest" else 12 * size
+    first += int(rng.integers(size)) * (start == "cut")
+    case = periodic_record(rng, system, n, period, first, known=start == "whole", **drawn_noise(rng))
+    reach = (0.0, (0.9 if start == "whole" else 1.5) * size)
+    whole = {"initial_state": "periodic"} if start == "whole" else {}
+    variants = {"range": Given(poles=poles, zeros=0, delay_bounds=reach, **whole)}
+    variants |= {"whole": {}}.get(start, {"typed": Given(poles=poles, zeros=0), "chosen": Given()})
+    return case.fitted_with(**{f"{start}, {name}": options for name, options in variants.items()})
+
+
+def one_sine(rng, number):
+    system = first_order(
+        rng.choice([2.0, drawn_gain(rng)]), 8.0 * rng.choice([1.0, rng.uniform(0.5, 2.0)]), rng.uniform(0.0, 9.0)
+    )
+    case = sine_record(rng, system, int(rng.integers(150, 401)), rng.uniform(15.0, 60.0), **drawn_noise(rng))
+    reach = (0.0, 10.0)
+    own = DelayProfile(1, 0, reach, initial_state="estimate", offset="estimate")
+    return case.fitted_with(**{"range": Given(poles=1, zeros=0, delay_bounds=reach), "class": own})
+
+
+def slow_pole(rng, number):
+    n, poles = int(rng.integers(150, 401)), 1 + number % 2
+    constants = [n * 20 ** rng.random(), n * rng.uniform(0.02, 0.2)][:poles]
+    a = np.poly([-1.0 / each for each in constants])
+    system = TransferFunction([drawn_gain(rng) * a[-1]], a, rng.uniform(0.0, 5.0))
+    t = irregular(rng, n) if number % 4 == 3 else np.arange(float(n))
+    case = binary_record(rng, system, t, int(rng.integers(3, 16)), **drawn_noise(rng))
+    return case.fitted_with(
+        **{
+            f"{poles} typed": Given(poles=poles, zeros=0),
+            f"{poles} range": Given(poles=poles, zeros=0, delay_bounds=(0.0, 10.0)),
+        }
+    )
+
+
+def linear_drift(rng, number):
+    n, poles, noise = int(rng.integers(200, 401)), int(rng.integers(1, 3)), drawn_noise(rng)
+    slowest = rng.uniform(3.0, n / 20)
+    system = drawn_system(rng, poles, slowest, rng.uniform(0.0, 8.0))
+    sizes = rng.uniform(1.0, 5.0) * 10 ** (-noise["db"] / 20), rng.uniform(1.0, 3.0)
+    drift, quiet = rng.choice([-1.0, 1.0]) * sizes[number % 2], 40 * (number % 4 > 1)
+    t, held = np.arange(float(n)), max(2, round(slowest * rng.uniform(0.7, 3.0)))
+    case = binary_record(rng, system, t, held, quiet, bool(rng.integers(2)), drift=drift, **noise)
+    typed = Given(poles=poles, zeros=0, delay_bounds=(0.0, 10.0))
+    size = ("small", "large")[number % 2]
+    return case.fitted_with(
+        **{
+            f"{size}, range": typed,
+            f"{size}, a1 known": replace(typed, fixed=(Fixed("a1", float(system.denominator[1])),)),
+            f"{size}, class": DelayProfile(poles, 0, (0.0, 10.0), offset="drift"),
+            f"{size}, chosen": Given(),
+        }
+    )
+
+
+def frequency_response(rng, number):
+    slowest = float(np.exp(rng.uniform(-2.0, 2.0)))
+    system = drawn_system(rng, 2, slowest, slowest * rng.uniform(0.0, 1.5), zeros=1)
+    w = np.geomspace(0.1, rng.uniform(5.0, 20.0), int(rng.integers(30, 61))) / slowest
+    case = measured_response(rng, system, w, rng.uniform(15.0, 35.0), known=bool(number % 2))
+    return case.fitted_with(
+        **{("errors unknown", "errors known")[number % 2]: FrequencyDomain(2, 1, (0.0, 3 * slowest))}
+    )
+
+
+def all_chosen(rng, number):
+    n, poles = int(rng.integers(200, 401)), 1 + number % 3
+    zeros = int(poles > 1 and rng.random() < 0.3)
+    slowest = rng.uniform(3.0, n / 20)
+    delay = rng.choice([0.0, rng.uniform(0.0, 1.0), rng.uniform(1.0, 5.0)]) * slowest
+    system = drawn_system(rng, poles, slowest, delay, zeros)
+    t = irregular(rng, n) if number % 5 == 4 else np.arange(float(n))
+    kind, noise = (
+        ("binary", "steps", "multisine")[number // 3 % 3],
+        drawn_noise(rng) | {"colour": 0.7 * (number % 4 == 1)},
+    )
+    if kind == "multisine":
+        w = np.linspace(0.1, 3.0, 15) / slowest
+        u = np.sin(np.outer(t, w) + rng.uniform(0, 2 * np.pi, w.size)).sum(axis=1)
+        case = simulated(rng, system, t, u, **noise)
+    else:
+        held = max(1, round(slowest * (rng.uniform(0.3, 1.5) if kind == "binary" else rng.uniform(3.0, 6.0))))
+        case = binary_record(rng, system, t, held, 0 if kind == "binary" else 10, kind == "steps", **noise)
+    return case.fitted_with(**{kind: Given()})
+
+
+def one_step(rng, number):
+    n, poles, bend = int(rng.integers(300, 601)), 1 + number % 2, 0.15 * (number % 4 == 2)
+    system = drawn_system(rng, poles, n * rng.uniform(0.03, 0.15), 0.0)
+    start, size = (11, 4.0) if number % 2 else (int(rng.integers(5, 0.15 * n)), rng.choice([-1.0, 4.0]))
+    noise = {"db": rng.uniform(20, 50), "offset": rng.uniform(-8, 8), "colour": 0.7 * (number % 5 == 4)}
+    case = step_record(rng, system, n, start, size, bend=bend, **noise)
+    typed = {f"{p}/{z}": Given(poles=p, zeros=z, delay_bounds=(0.0, 0.0)) for p, z in ((1, 0), (2, 0), (2, 1))}
+    typed = {name: options for name, options in typed.items() if options.poles >= poles} | {"chosen": Given()}
+    return case.fitted_with(**{("bent, " if bend else "") + name: options for name, options in typed.items()})
+
+
+def regular(rng, number):
+    n, poles = int(rng.integers(250, 401)), 1 + number % 3
+    slowest = rng.uniform(3.0, n / 20)
+    system = drawn_system(rng, poles, slowest, rng.uniform(0.0, 8.0))
+    t = irregular(rng, n) if number % 4 == 3 else np.arange(float(n))
+    noise = drawn_noise(rng) | {"colour": 0.7 * (number % 4 == 1)}
+    case = binary_record(rng, system, t, max(1, round(0.7 * slowest)), **noise)
+    reach = (0.0, 10.0)
+    own = DelayProfile(poles, 0, reach, offset="estimate")
+    return case.fitted_with(**{"range": Given(poles=poles, zeros=0, delay_bounds=reach), "class": own})
+
+
+def two_inputs(rng, number):
+    half, n = int(rng.integers(8, 31)), int(rng.integers(200, 401))
+    u1 = first_order(drawn_gain(rng), half * rng.uniform(0.2, 1.0), half * rng.uniform(0.0, 1.9))
+    u2 = first_order(drawn_gain(rng), rng.uniform(3.0, n / 20), rng.uniform(0.0, 8.0))
+    case = two_input_record(rng, {"u1": u1, "u2": u2}, n, half, int(rng.integers(2, 10)), **drawn_noise(rng))
+    reach = (0.0, 3.0 * half)
+    return case.fitted_with(
+        **{
+            name: Given(
+                poles=1,
+                zeros=0,
+                inputs=tuple(InputModel(each, poles=1, zeros=0, delay_bounds=own) for each in ("u1", "u2")),
+            )
+            for name, own in (("typed", None), ("range", reach))
+        }
+    )
+
+
+def long_delay(rng, number):
+    n, interval = int(rng.integers(150, 401)), 0.1
+    left = 0.9 * n * interval
+    system = first_order(drawn_gain(rng), left * rng.uniform(0.03, 0.08), left * rng.uniform(0.5, 0.8))
+    noise = {"db": rng.uniform(10, 30), "offset": rng.choice([0.0, 2.0])}
+    case = step_record(rng, system, n, n // 10, rng.choice([1.0, 3.0]), interval, **noise)
+    return case.fitted_with(chosen=Given(), typed=Given(poles=1, zeros=0))
+
+
+KINDS = {
+    "square": square_wave,
+    "period": whole_periods,
+    "sine": one_sine,
+    "slow-pole": slow_pole,
+    "drift": linear_drift,
+    "response": frequency_response,
+    "chosen": all_chosen,
+    "one-step": one_step,
+    "regular": regular,
+    "two-inputs": two_inputs,
+    "long-delay": long_delay,
+}
