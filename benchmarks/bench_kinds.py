@@ -66,30 +66,27 @@ def misses(intervals, truth):
     return distance > 1e-12, distance > FAR * length + 1e-12
 
 
-def equivalent(truth, found, printed):
-    """Return the true quantities of a repeating input's equivalent model with the delay nearest the printed one."""
+def equivalent(case, found, printed):
+    """Return the true quantities, for a stated repetition those of the equivalent model of nearest delay."""
+    truth = quantities(unpacked(packed(case.systems), case.systems))
     repetition = getattr(found, "repetition", None)
-    if repetition is None:
-        return truth
-    changed = dict(truth)
-    for name in [name for name in truth if name.endswith("delay")]:
-        prefix = getattr(repetition, "input", "")
-        if prefix and not name.startswith(f"{prefix}_"):
+    for name in case.systems if repetition is not None else ():
+        if name and name not in case.repeats:
             continue
-        times = round((printed[name].estimate - truth[name]) / repetition.shift)
-        changed[name] = truth[name] + times * repetition.shift
-        changed[name.removesuffix("delay") + "static_gain"] *= repetition.sign ** abs(times)
-    return changed
+        delay, gain = (f"{name}_{each}" if name else each for each in ("delay", "static_gain"))
+        times = round((printed[delay].estimate - truth[delay]) / repetition.shift)
+        truth[delay] += times * repetition.shift
+        truth[gain] *= repetition.sign ** abs(times)
+    return truth
 
 
 def count(case, options, found, rows):
     """Count each quantity of a fit in the rows of gain, delay and poles."""
-    truth = quantities(unpacked(packed(case.systems), case.systems))
     printed = {item.name: item for item in (*found.estimates, *found.derived)}
     interval = 0.0 if isinstance(case.data, FrequencyData) else float(np.diff(case.data.t).min())
     bounds = getattr(options, "delay_bounds", None)
     right = found.fit.model.order == sum(each.order for each in case.systems.values())
-    for name, value in equivalent(truth, found, printed).items():
+    for name, value in equivalent(case, found, printed).items():
         group = next((each for each in ("gain", "delay") if name.endswith(each)), "poles")
         if name not in printed or name not in case.half_widths or (group == "poles" and not right):
             continue
