@@ -116,10 +116,10 @@ def fit_of(case, options):
 
 
 def reason_of(error):
-    """Return an error with its place in the source."""
+    """Return an error without numbers in brackets, with its place in the source."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     place = "" if isinstance(error, CtidError) else f" ({last.filename.rpartition('/')[2]}, line {last.lineno})"
-    return f"{type(error).__name__}: {str(error)[:150]}{place}"
+    return f"{type(error).__name__}: {str(error).partition(' (')[0][:150]}{place}"
 
 
 def percent(row, columns):
