@@ -151,6 +151,10 @@ class Estimator(Generic[LaidOut, AnyFit]):
     def _estimate(self, laid_out: LaidOut, start: Start | None) -> AnyFit:
         raise NotImplementedError
 
+    def _minimum(self, laid_out: LaidOut, start: Start | None) -> AnyFit:
+        """Return the estimate without its uncertainty, if it can be separated."""
+        return self._estimate(laid_out, start)
+
     def check_start(self, start: Start) -> None:
         """Raise DataError for a start that the options exclude, without a record.
 
@@ -187,11 +191,19 @@ class Prepared(Generic[LaidOut, AnyFit]):
     in_ignored_loop: bool = False
 
     @one_thread
+    def minimum(self, start: Start | None = None) -> AnyFit:
+        """Estimate from one start, without the uncertainty if it can be separated."""
+        return self._of(self.estimator._minimum(self.laid_out, start))
+
+    @one_thread
     def fit(self, start: Start | None = None) -> AnyFit:
         """Estimate from one start."""
         if not isinstance(start, Start | None):
             raise TypeError(f"start must be a Start, such as Start(delay=0.5), not {type(start).__name__}")
-        fit = self.estimator._estimate(self.laid_out, start)
+        return self._of(self.estimator._estimate(self.laid_out, start))
+
+    def _of(self, fit: AnyFit) -> AnyFit:
+        """Return a fit that knows whether it ignores the loop of its record."""
         if not self.in_ignored_loop:
             return fit
         if fit.law is not None and getattr(self.estimator, "covariance", "") == "auto":

@@ -5,10 +5,12 @@ import numpy as np
 from ctid_cli.arrays import BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
+from ctid_cli.estimation.optimum.box import each_bounds
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.parameter_layout import Degrees, Layout, SumDegrees
 from ctid_cli.filtering.frequency_lines import FrequencyLines
+from ctid_cli.inference.repetition import Repetition, repetitions_of_lines
 from ctid_cli.signals.frequency_data import FrequencyData
 
 
@@ -34,6 +36,12 @@ class MeasuredLines(MeasuredRecords):
         integrators = (sum(self.problem.each_integrators),)
         self.treatment = Treatment(delay_bounds, "rest", "none", "foh", integrators=integrators)
         self.layout = Layout(degrees)
+
+    @property
+    def repetitions(self) -> tuple[tuple[Repetition, ...], ...]:
+        """Shifts by which the delay changes no line, or only the sign of all."""
+        low, high = each_bounds(self.treatment.delay_bounds)[0]
+        return (repetitions_of_lines(self.lines.frequencies) if low < high else (),)
 
     def check(self) -> None:
         """Raise DataError if the structure cannot be estimated from the data."""

@@ -8,6 +8,7 @@ are common.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -26,7 +27,7 @@ from ctid_cli.estimation.optimum.best_model import (
     best_sum,
     poles_of_submodels,
 )
-from ctid_cli.estimation.optimum.box import Bounds, each_bounds
+from ctid_cli.estimation.optimum.box import Bounds, Box, each_bounds
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
@@ -42,6 +43,7 @@ from ctid_cli.estimation.record_preparation import (
 )
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
 from ctid_cli.inference.innovations import sampled
+from ctid_cli.inference.repetition import Equivalent, Repetition, repetitions_of
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.sensitivities import Structure, SumStructure
 from ctid_cli.models.additive import AdditiveModel
@@ -49,6 +51,14 @@ from ctid_cli.models.several_inputs import AnyModel, SystemModel, delays_of, fra
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, Offset, OutputHold
+
+#: Level of an input, relative to its deviation, and difference of shifts, relative to them, that count as zero.
+SAME_LEVEL = 1e-3
+#: Distance below the range of a delay, as a share of a shift, from which its lower bound is tried.
+BELOW = 0.25
+#: Excess of the squared error, in units of the noise variance, that rejects a model: 95 % of chi-square with one
+#: degree of freedom.
+REJECTED = 3.84
 
 
 class Treatment(NamedTuple):
@@ -191,6 +201,78 @@ class MeasuredRecords:
         """Sum of the squares of the outputs about the mean of each record."""
         return float(sum(np.sum((y - y.mean()) ** 2) for y in self.outputs))
 
+    @cached_property
+    def repetitions(self) -> tuple[tuple[Repetition, ...], ...]:
+        """Repetitions of each input that leave its delay ambiguous; of several records those that all have.
+
+        An assumed input before the records is no evidence, a given level is. With the opposite sign a level other than
+        zero changes the offset.
+        """
+        treatment, found = self.treatment, []
+        known = isinstance(treatment.input_before, float | int)
+        for k, (low, high) in enumerate(each_bounds(treatment.delay_bounds)):
+            of_records = []
+            for record in self.records if low < high and not known else ():
+                signal = list(record.held.values())[k]
+                period = period_of(record) if treatment.initial_state == "periodic" else None
+                tolerance = SAME_LEVEL * float(np.std(signal.values))
+                all_of = repetitions_of(signal, float(record.t[-1]), period)
+                of_records.append([one for one in all_of if treatment.offset != "none" or abs(one.level) <= tolerance])
+            first, *others = of_records or [[]]
+            found.append(tuple(one for one in first if all(any(map(one.agrees, other)) for other in others)))
+        return tuple(found)
+
+    def with_least_delays(self, found: Optimum) -> Optimum:
+        """Return an optimum with the least of the delays in their ranges that the inputs cannot tell apart."""
+        for k, repetitions in enumerate(self.repetitions):
+            low = each_bounds(self.treatment.delay_bounds)[k][0]
+            for one in sorted(repetitions, key=lambda one: one.shift):
+                # A delay just below a whole shift may also be one just below the lower bound.
+                while found.delays[k] - one.shift > low - BELOW * one.shift:
+                    delays = list(found.delays)
+                    delays[k] = max(delays[k] - one.shift, low)
+                    trial = self.local((found.start[0], tuple(delays)))
+                    if trial.delays[k] >= found.delays[k] or not self.as_good(trial, found):
+                        break
+                    found = replace(trial, tried=found.tried, agree=found.agree)
+        return found
+
+    def as_good(self, one: Optimum, other: Optimum) -> bool:
+        """Return whether the data do not reject an optimum for another one, in white noise."""
+        count = sum(data.count for data in self.problem.records)
+        return one.squared_error <= other.squared_error * (1.0 + REJECTED / count)
+
+    def equivalents(self, model: SystemModel) -> tuple[Equivalent, ...]:
+        """Return the next models with other delays that the inputs cannot tell from an estimate."""
+        begin = self.begin(model)
+        return tuple(
+            Equivalent(delay, one.sign, self.degrees.inputs[k] if self.degrees.several else "")
+            for k, repetitions in enumerate(self.repetitions)
+            for one in repetitions
+            if (delay := self._equivalent_delay(begin, k, one)) is not None
+        )
+
+    def _equivalent_delay(self, begin: Begin, k: int, one: Repetition) -> float | None:
+        """Return the delay of an equivalent of a model; None if the samples after both delays distinguish them."""
+        assert isinstance(begin[1], tuple)
+        delays = list(begin[1])
+        delay = delays[k] + one.shift * (1 if delays[k] < one.shift * (1 - SAME_LEVEL) else -1)
+        if one.exact:
+            return delay
+        treatment, bounds = self.treatment, list(each_bounds(self.treatment.delay_bounds))
+        bounds[k] = min(delay, delays[k]), max(delay, delays[k])
+        offset: Offset = "none" if treatment.offset == "remove" else treatment.offset
+        with suppress(DataError):
+            own = treatment._replace(
+                delay_bounds=tuple(bounds), initial_state="estimate", offset=offset, input_before=None, bridge=False
+            )
+            both = MeasuredRecords(self.records, self.degrees, own, self.known)
+            here = both.local(begin)
+            delays[k] = delay
+            there = both.local((begin[0], tuple(delays)))
+            return there.delays[k] if both.as_good(there, here) else None
+        return None
+
     def used(self) -> tuple[BoolArray, ...]:
         """Return the mask of the samples of each record that enter the sums."""
         return tuple(used_samples(*pair) for pair in zip(self.data, self.records, strict=True))
@@ -232,17 +314,22 @@ class MeasuredRecords:
         """
         bounds, known = self.treatment.delay_bounds, self.known
         if self.problem.terms:
-            return best_sum(self.problem, bounds, starts, known=known)
+            return self.with_least_delays(best_sum(self.problem, bounds, starts, known=known))
         poles = self.degrees.poles - self.problem.integrators
-        return best_output_error(self.problem, poles, bounds, starts, known=known)
+        return self.with_least_delays(best_output_error(self.problem, poles, bounds, starts, known=known))
 
-    def local(self, *starts: Begin) -> Optimum:
+    def begin(self, model: SystemModel) -> Begin:
+        """Return the start of a search from a model."""
+        poles = self.free_poles(model)
+        return poles if self.problem.terms else np.atleast_1d(np.poly(poles).real), tuple(delays_of(model))
+
+    def local(self, *starts: Begin, box: Box | None = None) -> Optimum:
         """Return the least output error in the basins of denominators, without their integrators, and delays."""
         bounds, known = self.treatment.delay_bounds, self.known
         if self.problem.terms:
             return best_sum(self.problem, bounds, starts, grown=False, known=known)
         poles = starts[0][0].size - 1
-        found = best_local(self.problem, poles, bounds, starts, known=known)
+        found = best_local(self.problem, poles, bounds, starts, known=known, box=box)
         # Starts may omit poles at infinity.
         return replace(found, poles_at_infinity=self.degrees.poles - self.problem.integrators - poles)
 

@@ -6,7 +6,7 @@ parameters are refitted. A coefficient, or the time constant of one pole, is the
 the cost is minimised.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -27,6 +27,8 @@ DERIVED = ("gain", "time_constant", "damping")
 MET = 1e-9
 #: Search of the last coefficient of a denominator: factor of the range about its last value, and relative accuracy.
 REACH, ACCURACY = 50.0, 1e-7
+#: Shares of the interval between two bounds at which minima inside are computed.
+INSIDE = 0.01, 0.03, 0.1, 0.2, 0.4, 0.7, 1.0
 
 
 @dataclass(frozen=True)
@@ -151,6 +153,20 @@ class BoundedSearch:
                 found, ends = trial, fewer
         return found, ends
 
+    def inside(self, begin: Begin, ends: Mapping[str, float], name: str) -> Iterator[Optimum]:
+        """Yield minima with one of the active quantities, by name, ever farther inside its bounds."""
+        active = {one: ends[one.bound.name] for one in self.quantities if one.bound.name in ends}
+        moved = next(one for one in active if one.bound.name == name)
+        far = moved.bound.low + moved.bound.high - active[moved]
+        found = self.measured.local(begin)
+        for share in INSIDE:
+            try:
+                end = active[moved] + share * (far - active[moved])
+                found = self._least(found, active | {moved: end}, near=True)
+            except DataError:
+                return
+            yield found
+
     def _values(self, found: Optimum) -> dict[str, float]:
         layout, theta = self.measured.parameters(found)
         values = dict(zip(layout.names, theta.tolist(), strict=True))
@@ -164,8 +180,8 @@ class BoundedSearch:
         each = {one: one.end(values) for one in self.quantities}
         return {one: end for one, end in each.items() if end is not None}
 
-    def _least(self, start: Optimum, ends: Mapping[Quantity, float]) -> Optimum:
-        """Return the least cost with quantities fixed at ends of their bounds."""
+    def _least(self, start: Optimum, ends: Mapping[Quantity, float], *, near: bool = False) -> Optimum:
+        """Return the least cost with quantities fixed at ends of their bounds, or the minimum near the start."""
         held = self.known | {one.names[0]: one.held(end, 0.0) for one, end in ends.items() if one.along is None}
         related = [(one, end) for one, end in ends.items() if one.along is not None]
         along = {str(one.along) for one, _ in related} - held.keys()
@@ -178,7 +194,8 @@ class BoundedSearch:
 
         if not along:
             measured = self._knowing(values(None))
-            return measured.best([self._begin(measured, start)])
+            begin = self._begin(measured, start)
+            return measured.local(begin) if near else measured.best([begin])
         from scipy.optimize import minimize_scalar
 
         best, middle = [start], float(np.log(self._values(start)[next(iter(along))]))

@@ -147,7 +147,7 @@ class AdditiveOutputError(RecordsEstimator):
             KnownCoefficients.of_sum(self.terms, known) if known else NOTHING,
         )
 
-    def _estimate(self, measured: MeasuredRecords, start: Start | None) -> SubmodelsFit:
+    def _minimum(self, measured: MeasuredRecords, start: Start | None) -> SubmodelsFit:
         starts: list[Begin] = []
         method = GROWN
         if start is not None and start.model is not None:
@@ -156,7 +156,7 @@ class AdditiveOutputError(RecordsEstimator):
             delay = 0.5 * (low + high) if start.delay is None else start.delay
             starts, method = [(poles_of_submodels(start.model), delay)], GIVEN
         fit = self._least(measured, starts)
-        return self._of_submodels(measured, fit, method)._with_uncertainty(self.covariance, self.bootstrap_draws)
+        return self._of_submodels(measured, fit, method)
 
     def _of_submodels(self, measured: MeasuredRecords, fit: MeasuredFit, method: str) -> SubmodelsFit:
         """Return the fit with its submodels and their consistency conditions."""

@@ -1,6 +1,6 @@
 """Global output-error minimisation for measured records, with the delay."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -10,7 +10,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Bound, Estimator, Fixed, Start, checked_bounds, places_of
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, Treatment
-from ctid_cli.estimation.optimum.best_model import Begin
+from ctid_cli.estimation.optimum.best_model import Begin, Optimum
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimation.parameter_bounds import BoundedSearch, Quantity, quantities_of
@@ -25,6 +25,7 @@ from ctid_cli.estimators.measured_fit import (
     samples_at,
     with_noise,
 )
+from ctid_cli.estimators.reported_parameters import determined
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.several_inputs import delays_of, is_delay
@@ -52,6 +53,8 @@ class RecordsEstimator(Estimator[MeasuredRecords, MeasuredFit]):
     input_before: InputBefore
     noise_model: str
     integrators: int
+    covariance: Covariance
+    bootstrap_draws: int
 
     def _least(self, measured: MeasuredRecords, starts: Sequence[Begin] = ()) -> MeasuredFit:
         """Return the optimum for the given loss and noise model, without a covariance."""
@@ -63,6 +66,18 @@ class RecordsEstimator(Estimator[MeasuredRecords, MeasuredFit]):
         if self.noise_model == "white":
             return fit
         return with_noise(measured, fit, found, self.noise_model, starts)
+
+    def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
+        return self._with_errors(self._minimum(measured, start), measured)
+
+    def _with_errors(self, fit: MeasuredFit, measured: MeasuredRecords) -> MeasuredFit:
+        """Return a minimum with its standard errors, as far as the records determine it."""
+        law = fit.uncertainty(self.covariance, self.bootstrap_draws)
+        return determined(fit._with_law(law), measured, self._inside(fit, measured))[0]
+
+    def _inside(self, fit: MeasuredFit, measured: MeasuredRecords) -> list[Iterator[Optimum]]:
+        """Return minima ever farther inside each given bound that a parameter is at."""
+        return []
 
     def _simulated(self, fit: MeasuredFit, measured: MeasuredRecords) -> list[Array]:
         """Return the outputs of a fit, without removed means, at the used samples of prepared records."""
@@ -347,10 +362,10 @@ class DelayProfile(RecordsEstimator):
             KnownCoefficients.of(coefficients.poles, coefficients.numerators - 1, known, orders) if known else NOTHING,
         )
 
-    def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
+    def _minimum(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
         if self.bounds:
-            return self._within_bounds(measured)._with_uncertainty(self.covariance, self.bootstrap_draws)
-        return self._least(measured)._with_uncertainty(self.covariance, self.bootstrap_draws)
+            return self._within_bounds(measured)
+        return self._least(measured)
 
     def _within_bounds(self, measured: MeasuredRecords) -> MeasuredFit:
         """Return the least output error within the bounds of parameters, without a covariance."""
@@ -366,6 +381,16 @@ class DelayProfile(RecordsEstimator):
         met = tuple(Met(one.bound.name, end) for one, end in ends.items())
         status = Status.AT_BOUND if found.ending.optimal else fit.status
         return replace(fit, tangent=tangent, status=status, bounds_met=met)
+
+    def _inside(self, fit: MeasuredFit, measured: MeasuredRecords) -> list[Iterator[Optimum]]:
+        """Return minima ever farther inside each given bound that a parameter is at."""
+        if not fit.bounds_met:
+            return []
+        names = measured.degrees.inputs
+        known, degrees = self._known(names) if self.fixed else {}, self._degrees(names, free=False)
+        search = BoundedSearch(measured, self._quantities(names), degrees, known)
+        begin, ends = measured.begin(fit.parametrised), {one.name: one.end for one in fit.bounds_met}
+        return [search.inside(begin, ends, name) for name in ends]
 
     def _refine(self, records: Sequence[Record], *near: Begin) -> MeasuredFit:
         """Return the optimum in the basins of denominators, without their integrators, and delays.

@@ -47,6 +47,8 @@ class FrequencyDomainFit(MeasuredFit):
         then the imaginary parts.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
+    equivalents, undetermined, intervals, other_minima
+        As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     data : FrequencyData
         Frequency response.
     """
@@ -162,6 +164,8 @@ class FrequencyDomainSumFit(FrequencyDomainFit, SubmodelsFit):
         As in :class:`FrequencyDomainFit`.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`FrequencyDomainFit`.
+    equivalents, undetermined, intervals, other_minima
+        As in :class:`FrequencyDomainFit`.
     additive, start_method, loop_radius, in_loop, consistency, sampling, two_stage
         As in :class:`~ctid_cli.estimators.measured_submodels.SubmodelsFit`; only the first two apply.
     """
@@ -245,10 +249,10 @@ class FrequencyDomain(_OfLines, DelayProfile):
         measured.check()
         return Prepared(self, measured)
 
-    def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
+    def _minimum(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
         own = _lines(measured)
         found = self._within_bounds(own) if self.bounds else fitted(own, own.best(), None)
-        return FrequencyDomainFit(**_values(found), data=own.source)._with_uncertainty("auto", DRAWS)
+        return FrequencyDomainFit(**_values(found), data=own.source)
 
 
 @dataclass(frozen=True)
@@ -293,13 +297,12 @@ class FrequencyDomainSum(_OfLines, AdditiveOutputError):  # noqa: N818 - not an 
         measured.check()
         return Prepared(self, measured)
 
-    def _estimate(self, measured: MeasuredRecords, start: Start | None) -> SubmodelsFit:
+    def _minimum(self, measured: MeasuredRecords, start: Start | None) -> SubmodelsFit:
         own = _lines(measured)
         found = fitted(own, own.best(), None)
         size = sum(term.size for term in self.terms)
         additive = AdditiveModel.from_theta(found.theta[:size], self.terms, found.model.delay)
-        fit = FrequencyDomainSumFit(**_values(found), data=own.source, additive=additive, start_method=GROWN)
-        return fit._with_uncertainty("auto", DRAWS)
+        return FrequencyDomainSumFit(**_values(found), data=own.source, additive=additive, start_method=GROWN)
 
 
 def _lines(measured: MeasuredRecords) -> MeasuredLines:

@@ -15,7 +15,8 @@ from ctid_cli.estimation.optimum.best_model import part_of
 from ctid_cli.estimation.optimum.box import each_bounds
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
-from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.delay_profile import DelayProfile, RecordsEstimator
+from ctid_cli.estimators.determination import cost_of_delay
 from ctid_cli.estimators.frequency_domain import (
     FrequencyDomain,
     FrequencyDomainFit,
@@ -23,11 +24,11 @@ from ctid_cli.estimators.frequency_domain import (
     FrequencyDomainSumFit,
 )
 from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopFit, LoopOutputError
-from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
+from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit, pieces_text
 from ctid_cli.estimators.measured_submodels import LaidOutSubmodels, MeasuredSubmodels, SubmodelsFit
 from ctid_cli.estimators.reported_parameters import (
     LEVEL,
-    cost_of_delay,
+    determined,
     free_directions,
     reported_parameters,
     uncertainty_of_data,
@@ -39,7 +40,7 @@ from ctid_cli.inference.fit import DeferredFields, InputFit
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.input_response import output_bandwidth
-from ctid_cli.inference.intervals import BIASED, DelayInterval, UncertainValue
+from ctid_cli.inference.intervals import BIASED, NOT_DETERMINED, DelayInterval, UncertainValue
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
@@ -51,7 +52,7 @@ from ctid_cli.processors import one_thread
 from ctid_cli.progress import reported
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.record import Record, common_samples
-from ctid_cli.text import Shown
+from ctid_cli.text import Shown, listed
 
 #: Estimators of measured records, and their prepared records.
 Options = (
@@ -148,6 +149,32 @@ class Identification(DeferredFields, FittedModel, Shown):
 
     def __repr__(self) -> str:
         return f"Identification: {self.uncertainty.kind} covariance, {len(self.warnings)} warnings\n{self.fit!r}"
+
+    def marks(self, time_unit: str = "s") -> list[str]:
+        """Return what the records do not determine, and what a repeating input cannot tell apart, in sentences.
+
+        Parameters
+        ----------
+        time_unit : str, default "s"
+            Unit of time of the records.
+
+        Returns
+        -------
+        list of str
+            One sentence for each; empty if there is nothing to say.
+        """
+        items = (*self.estimates, *self.derived)
+        found = replace(self.fit, undetermined={}, intervals={}).marks(time_unit)
+        reasons: dict[str, list[str]] = {}
+        for item in items:
+            if item.is_undetermined:
+                values = " or ".join(f"{value:.5g}" for value in item.alternatives)
+                name = f"{item.name} ({values})" if values else item.name
+                reasons.setdefault(item.reason.removeprefix(NOT_DETERMINED).lstrip(":. "), []).append(name)
+            elif item.intervals:
+                found.append(f"{item.name}: {pieces_text(item.intervals)}, since other minima fit as well.")
+        found += [f"{NOT_DETERMINED}: {listed(names)}{f': {why}' if why else '.'}" for why, names in reasons.items()]
+        return found
 
     @property
     def fit_percent(self) -> float:
@@ -319,9 +346,12 @@ def identify(
     checked = None if validation is None else laid_out_validation(options, validation)
     # Errors for coloured noise are computed once, below, where a bootstrap can report its progress.
     prepared = replace(options, covariance="white").prepare(records)
-    fit: MeasuredFit | SubmodelsFit | LoopFit = prepared.fit()
+    fit: MeasuredFit | SubmodelsFit | LoopFit = prepared.minimum()
     uncertainty = fit.uncertainty(covariance, bootstrap_draws, progress)
-    fit = replace(fit, covariance=uncertainty.covariance, law=uncertainty)
+    fit = fit._with_law(uncertainty)
+    measured: Any = prepared.laid_out
+    inside = options._inside(fit, measured) if isinstance(options, RecordsEstimator) else []
+    fit, found = determined(fit, measured, inside)
     # Equivalent least-squares problem near the estimate, with pseudo-errors for another loss.
     linear, laid_out = fit.linear, prepared.laid_out
     if isinstance(laid_out, MeasuredRecords):
@@ -335,7 +365,7 @@ def identify(
     if fit.noise is not None:
         squared_error, size = fit.count * np.exp(fit.noise.deviance / fit.count), size + sum(fit.noise.orders)
     tests = tests_of(options, linear, records)
-    reported = reported_parameters(fit, uncertainty, answer.seen, laid_out)
+    reported = reported_parameters(fit, uncertainty, answer.seen, laid_out, found)
     free, matrix = free_directions(linear)[0], uncertainty_of_data(fit, uncertainty).covariance
     validated_on = None
     if checked is not None and validation is not None:

@@ -1,7 +1,7 @@
 """Fits to measured records: results, and their assembly from an optimum."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
@@ -24,11 +24,13 @@ from ctid_cli.inference.fit import DeferredFields, Fit, InputFit, Status
 from ctid_cli.inference.innovations import NoiseFit
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_covariance, orders_of
+from ctid_cli.inference.repetition import Equivalent
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
 from ctid_cli.inference.uncertainty import DRAW, DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of
 from ctid_cli.progress import calling
 from ctid_cli.signals.noise import ArmaNoise
+from ctid_cli.text import listed
 
 
 class Starts(NamedTuple):
@@ -93,6 +95,14 @@ class MeasuredFit(DeferredFields, Fit):
         Noise model estimated with the plant; None for an output-error fit.
     bounds_met : tuple of Met
         Parameters at a given bound, and these bounds.
+    equivalents : tuple of Equivalent
+        Models with other delays that a repeating input cannot tell from this one.
+    undetermined : mapping of str to str
+        Parameters that the records do not determine, with the reason; they have no standard error.
+    intervals : mapping of str to tuple of tuple of float
+        95 % intervals of parameters that do not follow from the covariance.
+    other_minima : tuple of Begin
+        Starts of further minima of the search that are nearly as low.
     """
 
     deferred: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
@@ -115,6 +125,46 @@ class MeasuredFit(DeferredFields, Fit):
     known: tuple[str, ...] = ()
     noise: NoiseEstimate | None = None
     bounds_met: tuple[Met, ...] = ()
+    equivalents: tuple[Equivalent, ...] = ()
+    undetermined: Mapping[str, str] = field(default_factory=dict)
+    intervals: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
+    other_minima: tuple[Begin, ...] = ()
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard errors by name; NaN where they are not defined, or the records do not determine the parameter."""
+        found, reach = super().standard_errors, self.quantiles if self.intervals else {}
+        for name, pieces in self.intervals.items():
+            (low, high), *more = pieces
+            found[name] = np.nan if more else 0.5 * (high - low) / reach[name]
+        return found | dict.fromkeys(self.undetermined, np.nan)
+
+    def marks(self, time_unit: str = "s") -> list[str]:
+        """Return what the records do not determine, and what a repeating input cannot tell apart, in sentences.
+
+        Parameters
+        ----------
+        time_unit : str, default "s"
+            Unit of time of the records.
+
+        Returns
+        -------
+        list of str
+            One sentence for each; empty if there is nothing to say.
+        """
+        found = []
+        for one in self.equivalents:
+            model = self.model.parts[one.input] if isinstance(self.model, MultiInputModel) else self.model
+            gain = one.sign * model.dc_gain
+            what = f"gain {gain:.5g}" if np.isfinite(gain) else "the opposite sign" if one.sign < 0 else "the same sign"
+            of, name = (f" of {one.input}", f" {one.input}") if one.input else ("", "")
+            found.append(f"Or {what} with delay{of} {one.delay:.5g} {time_unit}: the input{name} repeats.")
+        if self.undetermined:
+            found.append(f"Not determined: {listed(self.undetermined)}.")
+        for name, pieces in self.intervals.items():
+            if len(pieces) > 1:
+                found.append(f"{name}: {pieces_text(pieces)}, since other minima fit as well.")
+        return found
 
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
@@ -141,8 +191,11 @@ class MeasuredFit(DeferredFields, Fit):
         return found.in_ignored_loop if self.in_ignored_loop and kind == "auto" else found
 
     def _with_uncertainty(self, kind: Covariance, draws: int) -> Self:
-        """Return the fit with errors for a kind of noise; singular if it converged but has no covariance."""
-        law = self.uncertainty(kind, draws)
+        """Return the fit with errors for a kind of noise."""
+        return self._with_law(self.uncertainty(kind, draws))
+
+    def _with_law(self, law: Uncertainty) -> Self:
+        """Return the fit with its uncertainty; singular if it converged but has no covariance."""
         undefined = law.kind != "biased" and not np.isfinite(law.free_covariance).all()
         singular = self.status is Status.CONVERGED and undefined
         return replace(self, covariance=law.covariance, law=law, status=Status.SINGULAR if singular else self.status)
@@ -219,7 +272,9 @@ class MultiInputFit(MeasuredFit):
         As in :class:`MeasuredFit`.
     in_ignored_loop, theta, initial_states, offsets, input_offsets, residuals, sensitivities, used, starts
         As in :class:`MeasuredFit`; ``input_offsets`` has those of all inputs, record by record.
-    poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
+    poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met, equivalents, undetermined
+        As in :class:`MeasuredFit`.
+    intervals, other_minima
         As in :class:`MeasuredFit`.
     """
 
@@ -260,6 +315,16 @@ class MultiInputFit(MeasuredFit):
         """Raise an error, since there is no single transfer function."""
         inputs = ", ".join(self.model.parts)
         raise UsageError(f"the model has the inputs {inputs}; take one of them, such as fit.of_input(NAME)")
+
+
+def pieces_text(pieces: Sequence[tuple[float, float]]) -> str:
+    """Return separate intervals as text."""
+    return " or ".join(f"{low:.5g} to {high:.5g}" for low, high in pieces)
+
+
+def delay_names(fit: MeasuredFit) -> list[str]:
+    """Return the names of the delays of all inputs."""
+    return [f"{name}_delay" for name in fit.model.parts] if isinstance(fit, MultiInputFit) else ["delay"]
 
 
 AnyMeasuredFit = TypeVar("AnyMeasuredFit", bound=MeasuredFit)
@@ -328,6 +393,7 @@ def fitted(
         held_poles=tuple(found.held_poles.tolist()),
         tangent=_tangent(layout, found, given),
         known=tuple(np.array(layout.names)[given].tolist()),
+        other_minima=tuple(each.start for each in found.others),
         **values,
     )
     return fit

@@ -1,21 +1,21 @@
 """Reported parameters: standard errors, intervals, and quantities derived from a fit."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.optimum.box import each_bounds
-from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
+from ctid_cli.estimation.optimum.best_model import Optimum
+from ctid_cli.estimators.determination import Accepted, Determination, cost_of_delay, determination_of
+from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit, delay_names
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.derived import derived_parameters
-from ctid_cli.inference.intervals import BIASED, CostOfDelay, DelayInterval, UncertainValue
+from ctid_cli.inference.intervals import BIASED, DelayInterval, UncertainValue
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.several_inputs import delays_of
 
@@ -31,8 +31,29 @@ class ReportedParameters(NamedTuple):
     derived: tuple[UncertainValue, ...]
 
 
-def reported_parameters(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool, laid_out: Any) -> ReportedParameters:
+def determined(
+    fit: MeasuredFit, measured: Any, inside: Sequence[Iterator[Optimum]] = ()
+) -> tuple[MeasuredFit, Determination]:
+    """Return a fit with its undetermined parameters and equivalents, and the models that its records do not reject."""
+    assert fit.law is not None
+    found = determination_of(fit, fit.law, measured, inside)
+    items = [] if found.trivial else found.reported(lambda each, law: _estimates(each, law, set(), {}))
+    intervals = {item.name: item.intervals or ((item.low, item.high),) for item in items if item.status == "free"}
+    fit = replace(
+        fit,
+        other_minima=(),
+        equivalents=measured.equivalents(fit.parametrised) if isinstance(measured, MeasuredRecords) else (),
+        undetermined={item.name: item.reason for item in items if item.is_undetermined},
+        intervals={name: pieces for name, pieces in intervals.items() if np.isfinite(pieces).all()},
+    )
+    return fit, found
+
+
+def reported_parameters(
+    fit: MeasuredFit, uncertainty: Uncertainty, seen: bool, laid_out: Any, found: Determination | None = None
+) -> ReportedParameters:
     """Return parameters and derived quantities, with their uncertainty if it exists and a response is detected."""
+    found = found or Determination(((Accepted(fit, uncertainty, 0.0),),))
     biased, linear = uncertainty.kind == "biased", fit.linear
     free, hessian = free_directions(linear)
     singular = not condition_number(hessian) <= NEARLY_SINGULAR
@@ -47,10 +68,15 @@ def reported_parameters(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool, 
         if isinstance(laid_out, MeasuredRecords) and not biased and name in {*fit.parameter_names} - unclear:
             interval = _delay_interval(laid_out, linear, uncertainty, name)
             intervals |= {} if interval is None else {name: interval}
+    known = seen and not singular
+
+    def estimates(each: MeasuredFit, law: Uncertainty) -> tuple[UncertainValue, ...]:
+        return _estimates(each, law, unclear, intervals if each.theta is fit.theta else {})
+
     return ReportedParameters(
-        _estimates(fit, uncertainty, unclear, intervals),
+        tuple(found.reported(estimates)),
         next(iter(intervals.values()), None),
-        _derived(fit, uncertainty, seen and not singular),
+        tuple(found.reported(lambda each, law: _derived(each, law, known))),
     )
 
 
@@ -59,19 +85,13 @@ def uncertainty_of_data(fit: MeasuredFit, uncertainty: Uncertainty) -> Uncertain
     return fit.uncertainty("white") if uncertainty.kind == "biased" else uncertainty
 
 
-def delay_names(fit: MeasuredFit) -> list[str]:
-    """Return the names of the delays of all inputs."""
-    return [f"{name}_delay" for name in fit.model.parts] if isinstance(fit, MultiInputFit) else ["delay"]
-
-
 def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
     """Return the parameters that the data do not determine, for which no standard error is reported.
 
-    These are coefficients or delays with a standard error above ten times their size, and parameters correlated with
-    them.
+    These are coefficients with a standard error above ten times their size, and parameters correlated with them.
     """
     names, errors = fit.parameter_names, np.sqrt(np.diag(covariance))
-    looked_at = np.array([re.fullmatch(r"(.*_)?([ab]\d+|delay)", name) is not None for name in names])
+    looked_at = np.array([re.fullmatch(r"(.*_)?[ab]\d+", name) is not None for name in names])
     if not fit.signs_known:
         looked_at &= np.array(["a" not in name for name in names])
     unclear = ~np.isfinite(errors) | (looked_at & (errors > LARGE_STANDARD_ERROR * np.abs(fit.theta)))
@@ -94,31 +114,6 @@ def _delay_interval(
     """Return the profile-likelihood interval of a free delay; None if the quadratic interval is adequate."""
     profile, reach, error = cost_of_delay(measured, fit, uncertainty, name)
     return profile.interval(reach) if profile.quadratic_is_doubtful(error) else None
-
-
-def cost_of_delay(
-    measured: MeasuredRecords, fit: MeasuredFit, uncertainty: Uncertainty, name: str = "delay"
-) -> tuple[CostOfDelay, float, float]:
-    """Return the cost about a delay, the quantile of its interval, and its standard error."""
-    place, k = fit.parameter_names.index(name), delay_names(fit).index(name)
-    held = not fit.tangent[place].any()
-    if held:
-        # The effect of the noise on a delay at a bound is that of a free one.
-        fit = replace(fit, tangent=np.column_stack((fit.tangent, np.eye(fit.theta.size)[place])))
-        uncertainty = fit.uncertainty("white" if uncertainty.kind == "white" else "robust")
-    variance = float(uncertainty.covariance[place, place])
-    white = float(fit.uncertainty("white").covariance[place, place])
-    profile = CostOfDelay(
-        cache(lambda trial: measured.squared_error_at(fit.parametrised, trial, k)),
-        float(fit.theta[place]),
-        fit.cost * fit.count,
-        fit.count,
-        fit.theta.size - len(fit.known),
-        each_bounds(measured.treatment.delay_bounds)[k],
-        max(variance / white, np.finfo(float).tiny),
-    )
-    reach = uncertainty.quantile(np.eye(fit.theta.size)[place], LEVEL)
-    return profile, reach, float("nan") if held else float(np.sqrt(variance))
 
 
 def _estimates(

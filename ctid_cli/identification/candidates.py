@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli import progress
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
+from ctid_cli.estimation.common import Bound, Fixed
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import Optimum, best_near, best_of_orders
 from ctid_cli.estimation.optimum.box import Point, box_of, point_of
@@ -20,6 +21,7 @@ from ctid_cli.estimators.measured_fit import fitted
 from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking, Searched, penalised, ranked
 from ctid_cli.models.additive import Term
 from ctid_cli.models.several_inputs import AnyModel, delays_of
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import Holds, InitialState, InputBefore, Offset
@@ -73,12 +75,14 @@ class Span(NamedTuple):
     integrators: tuple[int, ...] = (0, 1)
     #: Range of the number of second-order submodels, if models are sums of these.
     modes: tuple[int, int] | None = None
+    #: Known and bounded parameters.
+    fixed: tuple[Fixed, ...] | None = None
+    bounds: tuple[Bound, ...] | None = None
 
-    @classmethod
-    def only(cls, options: Searched) -> "Span":
+    def only(self, options: Searched) -> "Span":
         """Return the span of the transfer functions of one structure."""
         poles, zeros = options.order - options.integrators, options.zeros
-        return cls((poles, poles), (zeros, zeros), (options.integrators,))
+        return Span((poles, poles), (zeros, zeros), (options.integrators,), None, self.fixed, self.bounds)
 
     @property
     def most_poles(self) -> int:
@@ -118,6 +122,7 @@ class Structures:
     options: DelayProfile
     measured: MeasuredRecords
     search: StructureSearch
+    span: Span
     #: Models of another setting, from which all searches start.
     near: Callable[[int, int], AnyModel | None] | None = None
     #: Whether each of several inputs may have fewer zeros than its structure.
@@ -132,10 +137,13 @@ class Structures:
         integrators: int,
         delays: tuple[float, float],
         several: Several,
+        span: Span,
         near: Callable[[int, int], AnyModel | None] | None = None,
     ) -> "Structures":
         """Prepare records."""
         hold, state, before, offset = setting
+        # The offset of an integrator's input is a drift of its output.
+        offset = "estimate" if integrators and offset == "drift" else offset
         options = DelayProfile(
             *(int(not integrators), 0, delays),
             initial_state=state,
@@ -146,10 +154,9 @@ class Structures:
         )
         held = [with_hold(record, hold) for record in records]
         measured = options.prepare(held).laid_out
-        # One box for all settings: a wider one for records at rest would favour rest.
-        box = box_of(measured.problem._replace(free_response=state != "periodic"), measured.treatment.delay_bounds)
+        box = box_of(measured.problem, measured.treatment.delay_bounds)
         search = StructureSearch(measured.problem, box, effort=QUICK, first_delays=several.first_delays)
-        return cls(held, hold, options, measured, search, near, several.fewer_zeros)
+        return cls(held, hold, options, measured, search, span, near, several.fewer_zeros)
 
     def tried(self, order: int, span: Span) -> list[Candidate | None]:
         """Fit all structures of an order, integrators included."""
@@ -159,6 +166,8 @@ class Structures:
     def fit(self, poles: int, zeros: int) -> Candidate | None:
         """Fit a structure; return None if there are too few samples."""
         if (poles, zeros) not in self.found:
+            if self.span.fixed or self.span.bounds:
+                return self._constrained(poles, zeros)
             options, measured = replace(self.options, poles=poles, zeros=zeros), self.measured
             laid_out = measured.with_degrees(options.order, [zeros] * len(measured.degrees.inputs))
             size = laid_out.layout.size - options.integrators
@@ -167,6 +176,24 @@ class Structures:
             found = fitted(laid_out, self._least(poles, zeros), None)
             candidate = Candidate(options, self.hold, found, size)
             self.found[poles, zeros] = self._with_fewer_zeros(candidate) if self.fewer_zeros else candidate
+        return self.found[poles, zeros]
+
+    def _constrained(self, poles: int, zeros: int) -> Candidate | None:
+        """Fit a structure with its known and bounded parameters; None if it does not have them."""
+        try:
+            options = replace(self.options, poles=poles, zeros=zeros, fixed=self.span.fixed, bounds=self.span.bounds)
+            laid_out = options.prepare(self.records).laid_out
+        except OptionError:
+            return None
+        size = laid_out.layout.size - int(np.count_nonzero(laid_out.given))
+        if SAMPLES_PER_PARAMETER * size > sum(data.count for data in laid_out.data):
+            return None
+        near = None if self.near is None or options.bounds else self.near(poles, zeros)
+        if near is None:
+            fit = options._minimum(laid_out, None)
+        else:
+            fit = fitted(laid_out, laid_out.local(laid_out.begin(near)), None)
+        self.found[poles, zeros] = Candidate(options, self.hold, fit, size)
         return self.found[poles, zeros]
 
     def _with_fewer_zeros(self, candidate: Candidate) -> Candidate:
@@ -288,8 +315,24 @@ class SmallModels:
             raise DataError(f"{named(self.records[0])}too few usable samples for a model's parameters")
         return ranked(found)
 
+    def larger(self, options: DelayProfile) -> Candidate | None:
+        """Fit a pole and a zero more, without known parameters, with an offset instead of the drift of some options."""
+        drifting = (key for key, one in self._structures.items() if one.options.offset == "drift")
+        found = next((key for key in drifting if _alike(self._structures[key].options, options)), None)
+        if found is None:
+            return None
+        setting, integrators = found
+        poles, zeros = options.poles + 1, options.zeros + 1
+        span = Span((poles, poles), (zeros, zeros), (integrators,))
+        own = Structures.of(
+            self.records, setting._replace(offset="estimate"), integrators, self.delays, self._begun(), span
+        )
+        return own.fit(poles, zeros) if poles + integrators <= MOST_POLES else None
+
     def _fitted(self, setting: Setting) -> Iterator[Candidate]:
         for integrators in self.span.integrators:
+            if integrators and setting.offset == "drift":
+                continue
             structures = self._laid_out(setting, integrators)
             for each in self.span.small(integrators, structures.search.box.delay_free, self.most):
                 candidate = structures.fit(*each)
@@ -304,7 +347,7 @@ class SmallModels:
             alike = next((self._structures[pair] for pair in pairs if pair[1] == integrators), None)
             near = None if alike is None else alike.model
             near = near if self.near is None else partial(self.near, integrators)
-            self._structures[key] = Structures.of(self.records, *key, self.delays, self._begun(), near)
+            self._structures[key] = Structures.of(self.records, *key, self.delays, self._begun(), self.span, near)
         return self._structures[key]
 
     def _begun(self) -> Several:
@@ -321,6 +364,18 @@ class SmallModels:
         return next(each).model(poles, zeros)
 
 
+def _alike(one: DelayProfile, other: DelayProfile) -> bool:
+    """Return whether two options treat the records alike."""
+    names = ("initial_state", "input_before", "offset", "integrators")
+    return all(getattr(one, name) == getattr(other, name) for name in names)
+
+
+def zero_on_integrator(model: TransferFunction, length: float) -> float | None:
+    """Return the zero that nearly cancels an integrator over a record of a length [s]; None if there is none."""
+    zero = min(model.zeros.real[model.zeros.imag == 0.0], key=abs, default=np.inf)
+    return float(zero) if model.denominator[-1] == 0.0 and abs(zero) * length < 1.0 else None
+
+
 def grid(
     records: Sequence[Record],
     setting: Setting,
@@ -330,7 +385,7 @@ def grid(
 ) -> Ranking:
     """Fit structures of increasing order, until the best lies inside the grid or none is left."""
     families = [
-        Structures.of(records, setting, integrators, delays, several)
+        Structures.of(records, setting, integrators, delays, several, span)
         if span.modes is None
         else Sums.of(records, setting, integrators, delays)
         for integrators in span.integrators

@@ -172,6 +172,8 @@ def _treatments(base: FittedOptions) -> Iterator[Change]:
     state = "estimate" if options.initial_state == "rest" else options.initial_state
     for offset in dict.fromkeys((options.offset, "estimate", "drift")):
         for initial_state in dict.fromkeys((options.initial_state, state)):
+            if (initial_state, offset) == ("estimate", "none"):  # which may hide a step response
+                continue
             fields: dict[str, Any] = {"initial_state": initial_state, "offset": offset}
             if initial_state != "rest":
                 fields["input_before"] = None

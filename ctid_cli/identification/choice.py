@@ -11,7 +11,7 @@ from ctid_cli.identification.criterion import Ranking, Searched
 from ctid_cli.inference.response_test import ResponseTest
 from ctid_cli.models.additive import terms_text
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.treatment import AskedHold, Hold, InitialState, InputBefore, LossKind, Offset
+from ctid_cli.signals.treatment import AskedHold, Hold, Holds, InitialState, InputBefore, LossKind, Offset
 from ctid_cli.text import probability
 
 #: Options that each of several inputs may have itself.
@@ -106,7 +106,8 @@ class Given:
         )
         none = isinstance(self.poles, int) or self.offset in ("remove", "drift") or self.initial_state == "periodic"
         free = (0,) if none else (0, 1)
-        return Span(poles, zeros, free if self.integrators is None else (self.integrators,))
+        integrators = free if self.integrators is None else (self.integrators,)
+        return Span(poles, zeros, integrators, fixed=self.fixed, bounds=self.bounds)
 
     def check(self) -> None:
         """Raise an OptionError if given options contradict each other."""
@@ -151,6 +152,10 @@ class Choice:
         Test for a response of the outputs to the inputs.
     sentences : tuple of str
         One for each choice, with its criterion and that of the runner-up.
+    gains : dict of str to tuple of float
+        Static gains with other treatments of the records that the criterion does not reject, if their signs differ.
+    holds : tuple
+        Other holds of the input that the criterion does not reject.
     """
 
     options: Searched
@@ -159,6 +164,8 @@ class Choice:
     ranking: Ranking = field(repr=False)
     answer: ResponseTest
     sentences: tuple[str, ...]
+    gains: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    holds: tuple[Holds, ...] = ()
 
     @property
     def has_model(self) -> bool:

@@ -12,25 +12,47 @@ from typing import Any, get_args
 import numpy as np
 
 from ctid_cli.estimation.common import check_greatest_delay
-from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
 from ctid_cli.estimators.identification import answer_of
 from ctid_cli.estimators.measured_fit import MultiInputFit
 from ctid_cli.identification import sentences
-from ctid_cli.identification.candidates import SMALL, Known, Setting, Several, SmallModels, Span, grid, with_hold
+from ctid_cli.identification.candidates import (
+    SMALL,
+    Known,
+    Setting,
+    Several,
+    SmallModels,
+    Span,
+    grid,
+    with_hold,
+    zero_on_integrator,
+)
 from ctid_cli.identification.choice import Choice, Given
-from ctid_cli.identification.criterion import Ranking, Searched
+from ctid_cli.identification.criterion import (
+    WORTH_A_DRIFT,
+    Ranking,
+    Searched,
+    gains_of_treatments,
+    holds_not_rejected,
+    ranked,
+    without_needless_drift,
+)
 from ctid_cli.identification.held_back import without_overfitted
 from ctid_cli.identification.initial_states import (
     State,
     beginning_is_likely,
+    begins_quietly,
     changes_at_the_beginning_only,
+    distinguishable_delays,
     excited_after,
+    greatest_delay,
+    is_slow,
     parts_of,
     states_of,
+    with_offsets,
     without_beginning,
 )
 from ctid_cli.identification.remedies import harmful_outliers, without_samples
-from ctid_cli.inference.input_response import analyse_response
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.processors import one_thread
@@ -39,8 +61,6 @@ from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record, as_records
 from ctid_cli.signals.treatment import Holds
 
-#: Greatest delay that is tried, and its limit if the record shows a later response, as shares of the record.
-LATEST, LATER = 0.1, 0.5
 #: The range of the delay ends at this multiple of the delay of a small model, plus this number of sampling intervals:
 #: with too few poles the delay is overestimated.
 REACH, FURTHER = 1.5, 3
@@ -48,6 +68,10 @@ REACH, FURTHER = 1.5, 3
 AT_END = 0.9
 #: The grid is fitted again for a range narrower than this share.
 MUCH_NARROWER = 0.5
+#: Decrease of the criterion from which a response begins after one interval of a repeating input.
+EVIDENT = 10.0
+#: Longest range of delays after which a response may begin, as a share of the record.
+HALF = 0.5
 #: Smaller differences of criteria are rounding: for integrators alone a state is equivalent to an offset.
 TIE = 1e-3
 
@@ -109,11 +133,27 @@ class _Choosing:
         self.first_reasons = [sentences.NO_INTEGRATOR] if drifts else []
         # A periodic state is that of the whole record.
         self.part, self.from_start = (records, True) if given.initial_state == "periodic" else parts_of(records)
-        self.several = Several(given.delays_of_inputs, not isinstance(given.zeros, int))
+        self.several = Several(self._ranges_of_inputs(), not isinstance(given.zeros, int))
         self.first_hold: Holds = "zoh" if given.hold == "auto" else given.hold
         self.reasons: list[str] = []
+        #: Whether the input repeats: its range of delays is kept whole.
+        self.repeats = False
+        #: Static gains of treatments that the criterion does not reject, if their signs differ, by name.
+        self.gains: dict[str, tuple[float, ...]] = {}
+        #: Holds of the input that the criterion does not reject beside the best.
+        self.holds: tuple[Holds, ...] = ()
         #: Small models of several inputs, near which the settings are compared.
         self.known: Known | None = None
+
+    def _ranges_of_inputs(self) -> tuple[InputModel, ...] | None:
+        """Return the given ranges of the delays of single inputs, and those that repeating inputs can tell apart."""
+        given, first = self.given, self.part[0]
+        ranges = {one.name: one for one in given.delays_of_inputs or ()}
+        for name in first.held if first.several and given.delay_bounds is None else ():
+            interval = distinguishable_delays([record.of_input(name) for record in self.part], given)
+            if name not in ranges and np.isfinite(interval):
+                ranges[name] = InputModel(name, delay_bounds=(0.0, _rounded(interval)))
+        return tuple(ranges.values()) or None
 
     def choice(self) -> Choice:
         """Return the choice."""
@@ -123,7 +163,7 @@ class _Choosing:
             return self._typed(setting, delays)
         ranking = self._grid(setting, delays)
         # A state, or a far too long delay, may make up for the dynamics that small models miss.
-        span, narrower = Span.only(ranking.best.options), self._range_of(ranking, delays)
+        span, narrower = self.span.only(ranking.best.options), self._range_of(ranking, delays)
         narrower = narrower if narrower[1] < MUCH_NARROWER * delays[1] else delays
         confirmed = self._setting(span, narrower, lambda *_: ranking.best.fit.model)
         if (narrower, confirmed) != (delays, setting):
@@ -133,8 +173,32 @@ class _Choosing:
         while delays[1] < latest and max(delays_of(ranking.best.fit.model)) > AT_END * delays[1]:
             delays = 0.0, _rounded(min(2.0 * delays[1], latest))
             ranking = without_overfitted(self._grid(setting, delays), self._held(setting))
+        setting, ranking = self._with_drift_for_integrator(setting, ranking, delays)
         about = sentences.of_grid(ranking, delays, self.given, self.time_unit)
         return self._chosen(ranking.best.options, setting, ranking, about)
+
+    def _with_drift_for_integrator(
+        self, setting: Setting, ranking: Ranking, delays: tuple[float, float]
+    ) -> tuple[Setting, Ranking]:
+        """Return models with a drift instead of an integrator that a zero nearly cancels, if they are better."""
+        options, model = ranking.best.options, ranking.best.fit.model
+        free = self.given.offset is None and self.given.integrators is None and setting.initial_state != "periodic"
+        if not (free and isinstance(options, DelayProfile) and options.integrators and not self.part[0].several):
+            return setting, ranking
+        if zero_on_integrator(model, max(record.duration for record in self.part)) is None:
+            return setting, ranking
+        drifting = setting._replace(offset="drift")
+        span = self.span._replace(integrators=(0,))
+        if not self.from_start:
+            drifting = drifting._replace(initial_state="estimate", input_before=None)
+        held = self._held(drifting)
+        others = without_overfitted(grid(held, drifting, span, delays, self.several), held)
+        both = ranked([ranking.best, others.best])
+        if both.best.fit is not others.best.fit:
+            return setting, ranking
+        self.reasons = [text for text in self.reasons if not text.startswith("Offset")]
+        self.reasons.append(sentences.of_drift(both))
+        return drifting, others
 
     def _typed(self, setting: Setting, delays: tuple[float, float]) -> Choice:
         """Return the choice if degrees of single inputs are given."""
@@ -161,7 +225,7 @@ class _Choosing:
         reasons = [*self.first_reasons, *self.reasons, *about]
         reasons += [sentences.of_criterion(ranking)] * bool(reasons)
         held = tuple(with_hold(record, setting.hold) for record in self.records)
-        return Choice(options, held, fitted, ranking, answer, tuple(reasons))
+        return Choice(options, held, fitted, ranking, answer, tuple(reasons), self.gains, self.holds)
 
     def _grid(self, setting: Setting, delays: tuple[float, float]) -> Ranking:
         if not self.from_start:
@@ -182,20 +246,41 @@ class _Choosing:
         if given is not None and not several:
             return delays, latest
         # Assuming rest may bias the delay; an estimated state does not.
-        settings = self._settings(latest)[-1:]
+        settings = self._settings(latest)
+        settings = settings[-1:] if not (self.from_start and begins_quietly(self.part)) else settings[:1]
         most = len(SMALL) if several else 2
         models = SmallModels(self._common(settings, latest), self.span, delays, self.several, most=most)
         ranking = models.compared(settings)
         self._note(ranking)
         self.known = models.model if several else None
+        if self.repeats and self._begins_later(ranking, latest):
+            delays = 0.0, 2.0 * latest
         return self._range_of(ranking, delays), latest
 
+    def _begins_later(self, ranking: Ranking, latest: float) -> bool:
+        """Return whether a response from rest begins after one interval of a repeating input, by the first samples."""
+        settings = self._settings(latest)
+        rests = [each for each in settings if each.initial_state == "rest"]
+        if not rests or 2.0 * latest > HALF * min(record.duration for record in self.part):
+            return False
+        part = self._common(settings, latest)
+        found = SmallModels(part, self.span, (0.0, 2.0 * latest), self.several, most=2).compared(rests)
+        best = ranked([*ranking.candidates, *found.candidates]).best
+        if max(delays_of(best.fit.model)) <= latest:
+            return False
+        within = SmallModels(part, self.span, (0.0, latest), self.several, most=2).compared(rests)
+        own = ranked([*ranking.candidates, *within.candidates, best]).candidates
+        fits = [each for each in own if each.fit is not best.fit]
+        return own[0].fit is best.fit and own[0].criterion < fits[0].criterion - EVIDENT
+
     def _latest(self) -> float:
-        """Return the greatest delay that is tried [s]."""
-        length = min(record.duration for record in self.part)
-        hints = [analyse_response(each).delay for record in self.part for each in record.each_input]
-        later = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
-        return _rounded(min(max(LATEST * length, later), LATER * length))
+        """Return the greatest delay that is tried [s]: one whole interval that a repeating input can tell apart."""
+        latest = greatest_delay(self.part)
+        if not self.part[0].several:
+            interval = distinguishable_delays(self.part, self.given)
+            self.repeats = bool(np.isfinite(interval))
+            latest = interval if self.repeats else latest
+        return _rounded(latest)
 
     def _note(self, models: Ranking) -> None:
         """Keep the delays of the best small model, from which later searches of several inputs start."""
@@ -203,8 +288,8 @@ class _Choosing:
             self.several = self.several._replace(first_delays=tuple(delays_of(models.best.fit.model)))
 
     def _range_of(self, ranking: Ranking, delays: tuple[float, float]) -> tuple[float, float]:
-        """Return the range around the delay of the best model, within another; a given range unchanged."""
-        if self.given.delays_given is not None:
+        """Return the range around the delay of the best model, within another; a given or whole one unchanged."""
+        if self.given.delays_given is not None or self.repeats:
             return delays
         interval = max(float(np.median(np.diff(record.t))) for record in self.part)
         reach = REACH * max(delays_of(ranking.best.fit.model)) + FURTHER * interval
@@ -220,28 +305,45 @@ class _Choosing:
         rests = [each for each in settings if each.initial_state == "rest"]
         if len(rests) > 1:
             # All samples determine the level before the record, mainly the first ones.
-            level = SmallModels(self.part, span, delays, self.several, near).compared(rests).best.options.input_before
+            small = SmallModels(self.part, span, delays, self.several, near)
+            level = small.compared(rests).best.options.input_before
             settings = [each for each in settings if each.initial_state != "rest" or each.input_before == level]
         models = SmallModels(self._common(settings, delays[1]), span, delays, self.several, near)
         if self.given.offset is None:
-            settings += [each._replace(offset="none") for each in settings]
-        ranking = models.compared(settings)
+            settings = with_offsets(settings, self.part)
+        ranking = self._with_needed_drift(models, models.compared(settings))
         self._note(ranking)
         self.models, best = models, self._treated(ranking, delays[1])
         setting = Setting(self.first_hold, best.initial_state, best.input_before, best.offset)
+        self.gains = gains_of_treatments(ranking)
         holds = self._holds()
         if len(holds) > 1:
             compared = models.compared([setting._replace(hold=hold) for hold in holds])
             self.reasons.append(sentences.of_setting(compared, "hold"))
             setting = setting._replace(hold=compared.best.hold)
+            self.holds = holds_not_rejected(compared)
         return setting
+
+    def _with_needed_drift(self, models: SmallModels, ranking: Ranking) -> Ranking:
+        """Return the candidates without a drift unless it is needed: also beside a pole and a zero more without it."""
+        kept = without_needless_drift(ranking)
+        options = kept.best.options
+        if options.offset != "drift" or not isinstance(options, DelayProfile):
+            return kept
+        larger = models.larger(options)
+        others = [each for each in ranking.candidates if each.options.offset != "drift"]
+        if larger is None or ranked([*kept.candidates, larger]).best.fit is not larger.fit:
+            return kept
+        return replace(ranking, candidates=tuple(others))
 
     def _treated(self, models: Ranking, length: float) -> Searched:
         """Return state and offset: rest, unless the criterion or the first samples reject it."""
         rest, estimated = (models.of(initial_state=state) for state in ("rest", "estimate"))
         chosen = models
         if rest is not None and estimated is not None:
-            at_rest = rest.best.criterion <= estimated.best.criterion + TIE
+            # From rest, a pole slower than the record is as flexible as a drift.
+            lead = WORTH_A_DRIFT if is_slow(rest.best.fit.model, self.part) else -TIE
+            at_rest = rest.best.criterion <= estimated.best.criterion - lead
             likely = not at_rest or beginning_is_likely(rest.best, models.noise, self.part, length)
             chosen = rest if at_rest and likely else estimated
             self.reasons.append(sentences.of_state(rest.best, estimated.best, likely))
@@ -257,6 +359,8 @@ class _Choosing:
     def _settings(self, latest: float) -> list[Setting]:
         """Return settings with the states that can be compared, with an offset."""
         states: list[State] = states_of(self.part, self.given) if self.from_start else [("estimate", None)]
+        if self.from_start and begins_quietly(self.part) and ("rest", "first") in states:
+            states = [("rest", "first")]
         if len(states) > 1 and not excited_after(self.part, latest):
             states = [state for state in states if state[0] != "estimate"]
         offset = self.given.offset or "estimate"

@@ -19,7 +19,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.estimators.measured_fit import MeasuredFit
+from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
 from ctid_cli.inference.covariance import LARGEST_CONDITION
 from ctid_cli.inference.criteria import (
     InformationCriteria,
@@ -29,6 +29,7 @@ from ctid_cli.inference.criteria import (
 )
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
 from ctid_cli.models.additive import terms_text
+from ctid_cli.models.several_inputs import fractions_of
 from ctid_cli.signals.treatment import Holds
 
 #: Options of the compared models: one transfer function, or a sum of submodels.
@@ -36,6 +37,13 @@ Searched = DelayProfile | AdditiveOutputError
 #: Penalty of a parameter over that in BIC. For 134 simulated records of known structure, models so chosen had at most
 #: 1.25 times the error of the true structure in 87 %, with BIC itself in 84 %.
 PENALTY = 1.5
+#: Options of the treatment of records, and increase of the criterion from which one is rejected.
+TREATMENT, REJECTED = ("initial_state", "input_before", "offset"), 10.0
+#: Increase of the criterion up to which models with equal parameters are likely: 95 % of chi-square with one degree of
+#: freedom.
+LIKELY = 3.84
+#: Decrease of the criterion from which a drift is estimated.
+WORTH_A_DRIFT = 10.0
 #: Names of the bounds at which a pole pair follows an oscillation of this record's noise.
 UNDAMPED = frozenset({"least_damping", "imaginary"})
 
@@ -144,6 +152,41 @@ class Ranking:
         """Return the first candidate that is not better than the best and differs in a named option, or None."""
         others = (each for each in self.candidates if any(each.value(n) != self.best.value(n) for n in names))
         return next((each for each in others if each.criterion >= self.best.criterion), None)
+
+
+def without_needless_drift(ranking: Ranking) -> Ranking:
+    """Return the candidates without a drift of the output, unless it lowers the criterion by ``WORTH_A_DRIFT``.
+
+    A needless drift may describe a part of the response: in one case it replaced an integrator, with 8.6 times the
+    error. The estimated offset of an integrator is a drift too, and needs no lead.
+    """
+    others = tuple(each for each in ranking.candidates if each.options.offset != "drift")
+    constant = [each.criterion for each in others if not each.options.integrators]
+    if not others or ranking.best.criterion < min(constant, default=-np.inf) - WORTH_A_DRIFT:
+        return ranking
+    return replace(ranking, candidates=others)
+
+
+def gains_of_treatments(ranking: Ranking) -> dict[str, tuple[float, ...]]:
+    """Return the static gains of treatments of the records within ``REJECTED`` of the best, if their signs differ."""
+    best_of: dict[tuple[object, ...], Candidate] = {}
+    for each in ranking.candidates:
+        if each.is_admissible and each.criterion <= ranking.best.criterion + REJECTED:
+            best_of.setdefault(tuple(each.value(name) for name in TREATMENT), each)
+    found: dict[str, list[float]] = {}
+    for each in best_of.values():
+        names = list(each.fit.model.parts) if isinstance(each.fit, MultiInputFit) else [""]
+        for name, model in zip(names, fractions_of(each.fit.model), strict=False):
+            if np.isfinite(model.dc_gain):
+                found.setdefault(f"{name}_static_gain" if name else "static_gain", []).append(float(model.dc_gain))
+    return {name: tuple(gains) for name, gains in found.items() if min(gains) < 0.0 < max(gains)}
+
+
+def holds_not_rejected(ranking: Ranking) -> tuple[Holds, ...]:
+    """Return the holds whose best candidate is within ``LIKELY`` of the best one, without that of the best."""
+    each = {one.hold: one.criterion for one in reversed(ranking.candidates) if one.is_admissible}
+    best = ranking.best
+    return tuple(hold for hold, own in each.items() if hold != best.hold and own <= best.criterion + LIKELY)
 
 
 def ranked(candidates: Sequence[Candidate]) -> Ranking:

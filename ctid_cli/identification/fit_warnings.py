@@ -8,8 +8,9 @@ import numpy as np
 from ctid_cli.arrays import BoolArray
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Identification, unsafe_intervals
-from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
-from ctid_cli.estimators.reported_parameters import delay_names, free_directions
+from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit, delay_names
+from ctid_cli.estimators.reported_parameters import free_directions
+from ctid_cli.identification.candidates import zero_on_integrator
 from ctid_cli.identification.changes import Kind
 from ctid_cli.identification.remedies import Remedy, Trials, tried_remedies
 from ctid_cli.identification.sentences import outlying, spelled
@@ -166,8 +167,8 @@ def _of_cancelled_integrator(found: Identification, time_unit: str) -> Iterator[
     """Yield that a zero nearly cancels the integrator, which then describes a drift of the output."""
     longest = max(record.duration for record in found.records)
     for model in fractions_of(found.fit.model) if isinstance(found.options, DelayProfile) else ():
-        zero = min(model.zeros.real[model.zeros.imag == 0.0], key=abs, default=np.inf)
-        if model.denominator[-1] == 0.0 and abs(zero) * longest < 1.0:
+        zero = zero_on_integrator(model, longest)
+        if zero is not None:
             gain = model.numerator[-2] / model.denominator[-2]
             what = f"The zero at {zero:.2g} rad/{time_unit} nearly cancels the integrator over this record"
             yield f"{what}, which describes a drift of the output; without both the static gain is {gain:.3g}"

@@ -10,6 +10,7 @@ from ctid_cli.estimators.identification import Identification, Options
 from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.choose import choose
+from ctid_cli.identification.chosen_intervals import joined_with_holds, joined_with_larger, with_other_gains
 from ctid_cli.identification.fit_warnings import with_warnings
 from ctid_cli.identification.validation import laid_out_for, validated_on
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress
@@ -101,6 +102,9 @@ def identify(
         laid_out_for(other, choice.options, given)
     found = identification.identify(choice.options, choice.records, None, *noise)
     found = replace(found, choices=choice.sentences)
+    found = joined_with_holds(with_other_gains(found, choice), choice)
+    if not (isinstance(given.poles, int) and isinstance(given.zeros, int)):
+        found = joined_with_larger(found, choice)
     if other is not None:
         found = replace(found, validation=validated_on(other, choice.options, found.fit, given))
     return with_warnings(found, time_unit)

@@ -7,7 +7,7 @@ import numpy as np
 
 from ctid_cli.estimators.frequency_domain import MISFIT, FrequencyDomain, FrequencyDomainFit, FrequencyDomainSum
 from ctid_cli.estimators.identification import Identification
-from ctid_cli.estimators.reported_parameters import free_directions, reported_parameters
+from ctid_cli.estimators.reported_parameters import determined, free_directions, reported_parameters
 from ctid_cli.identification.fit_warnings import LOW_FIT, MOST, of_conditioning, of_lost_poles, of_search
 from ctid_cli.identification.remedies import DECISIVE
 from ctid_cli.inference.criteria import information_criteria, r_t_squared, young_information_criterion
@@ -51,19 +51,20 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain | 
     {'b0': 2.01, 'a1': 1.01}
     """
     prepared = options.prepare(data)
-    fit = prepared.fit()
+    minimum = prepared.minimum()
+    law = minimum.uncertainty("auto")
+    fit, found = determined(minimum._with_law(law), prepared.laid_out)
     assert isinstance(fit, FrequencyDomainFit)
-    assert fit.law is not None
     (residuals,), (values,) = fit.residuals, prepared.laid_out.outputs
     response, free = _response_test(fit), free_directions(fit)[0]
     return Identification(
         options=options,
         fit=fit,
         answer=response,
-        **reported_parameters(fit, fit.law, response.seen, prepared.laid_out)._asdict(),
+        **reported_parameters(fit, law, response.seen, prepared.laid_out, found)._asdict(),
         tests=(),
         criteria=information_criteria(float(residuals @ residuals), fit.count, fit.theta.size - len(fit.known)),
-        yic=young_information_criterion(residuals, values, fit.theta[free], fit.law.covariance[np.ix_(free, free)]),
+        yic=young_information_criterion(residuals, values, fit.theta[free], law.covariance[np.ix_(free, free)]),
         r_t_squared=r_t_squared(residuals, values),
         warnings=tuple(f"{text}." for text in [*_of_delay(fit, options), *_warnings(fit, response)][:MOST]),
     )

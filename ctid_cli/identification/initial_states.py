@@ -6,13 +6,16 @@ from dataclasses import replace
 import numpy as np
 
 from ctid_cli.estimation.optimum.best_model import most_active
-from ctid_cli.estimation.record_preparation import part_of_record
-from ctid_cli.identification.candidates import with_hold
+from ctid_cli.estimation.record_preparation import part_of_record, period_of
+from ctid_cli.identification.candidates import Setting, with_hold
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import Candidate
+from ctid_cli.inference.input_response import analyse_response
 from ctid_cli.inference.noise_model import NoiseModel
+from ctid_cli.inference.repetition import range_of, repetitions_of
 from ctid_cli.inference.residual_tests import chi_square_tail
 from ctid_cli.inference.signal_features import FEW_CHANGES, input_moves
+from ctid_cli.models.several_inputs import AnyModel, fractions_of
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, beginning
 from ctid_cli.signals.treatment import InitialState, InputBefore
@@ -30,7 +33,18 @@ UNLIKELY = 1e-2
 PART = 2500
 #: The beginning of a record is used for the whole if input and output vary there by at least this share of all.
 LIVELY = 0.5
-
+#: Greatest delay that is tried, as a share of the record; with a later response it is this multiple of its latest
+#: beginning plus this number of sampling intervals, at most this share of the time after the first change of the input.
+LATEST, LATE, FURTHER, REMAINING = 0.1, 1.5, 3, 0.9
+#: A response is seen where the output is this many deviations away from its level in a quiet beginning.
+ONSET = 5.0
+#: Longest range of the delay within one interval of a repeating input, as a share of the record.
+WHOLE = 0.999
+#: Least time before the first of many changes of an input that shows rest, relative to the longest between two of them.
+LONGER = 1.2
+#: Blocks of the output before the first change of the input, and their least size. The output is constant if their
+#: means differ by less than this number of standard errors, or by less than this share of its deviation.
+QUIET_BLOCKS, QUIET_SIZE, QUIET_ERRORS, QUIET_SHARE = 5, 2, 4.5, 0.05
 
 #: State before the records, and the input before them.
 State = tuple[InitialState, InputBefore]
@@ -55,6 +69,101 @@ def states_of(records: Sequence[Record], given: Given) -> list[State]:
         levels.append(None)
     found: list[tuple[InitialState, InputBefore]] = [("rest", level) for level in levels]
     return found + [("estimate", None)] * (state is None and before is None and varies)
+
+
+def with_offsets(settings: Sequence[Setting], records: Sequence[Record]) -> list[Setting]:
+    """Return settings with an estimated offset, and those with none or a drift that are compared with them.
+
+    An estimated state without an offset fits a step response with a slow free response and a gain of either sign, and
+    rest at a level other than zero has the offset of the response to it.
+    """
+    firsts = [float(signal.values[0]) for record in records for signal in record.held.values()]
+    found = list(settings)
+    for each in settings:
+        at_zero = each.input_before in (None, 0.0) or (each.input_before == "first" and not any(firsts))
+        if each.initial_state != "estimate" and at_zero:
+            found.append(each._replace(offset="none"))
+        if each.initial_state != "periodic":
+            found.append(each._replace(offset="drift"))
+    return found
+
+
+def greatest_delay(records: Sequence[Record]) -> float:
+    """Return the greatest delay that is tried [s]: a share of the record, or beyond the beginning of the response."""
+    interval = max(float(np.median(np.diff(record.t))) for record in records)
+    hints = [analyse_response(each).delay for record in records for each in record.each_input]
+    lates = [hint.late for hint in hints if hint is not None] + [_onset(record) for record in records]
+    late = max(LATE * late + FURTHER * interval for late in lates)
+    remaining = min(record.t[-1] - _first_change(record) for record in records)
+    return float(min(max(LATEST * min(record.duration for record in records), late), REMAINING * remaining))
+
+
+def _onset(record: Record) -> float:
+    """Return the time from the first change of an input to the first response after a quiet beginning; 0 without."""
+    if not _is_quiet(record):
+        return 0.0
+    t, y, first = record.t[record.valid], record.y[record.valid], _first_change(record)
+    before = y[t < first]
+    away = np.abs(y - before.mean()) > max(ONSET * float(before.std()), QUIET_SHARE * float(y.std()))
+    # Two samples in a row: one may be an outlier.
+    both = np.flatnonzero(away[:-1] & away[1:] & (t[:-1] >= first))
+    return float(t[both[0]] - first) if both.size else 0.0
+
+
+def _first_change(record: Record) -> float:
+    """Return the first instant at which an input changes within a record [s]."""
+    moving = [signal.t[1:][np.diff(signal.values) != 0.0] for signal in record.held.values()]
+    inside = [float(t[t > record.t[0]].min(initial=np.inf)) for t in moving]
+    first = min(inside)
+    return first if first < record.t[-1] else float(record.t[0])
+
+
+def distinguishable_delays(records: Sequence[Record], given: Given) -> float:
+    """Return the length of the range of delays that the input can tell apart [s]; infinite if it does not repeat."""
+    if isinstance(given.input_before, float | int):
+        return float("inf")
+    periodic = given.initial_state == "periodic"
+    each = [
+        range_of(repetitions_of(record.input, float(record.t[-1]), period_of(record) if periodic else None))
+        for record in records
+    ]
+    longest = max(each)
+    return min(longest, *(WHOLE * record.duration for record in records)) if np.isfinite(longest) else longest
+
+
+def is_slow(model: AnyModel, records: Sequence[Record]) -> bool:
+    """Return whether a model has a pole slower than the records, other than an integrator."""
+    poles = np.abs(np.concatenate([each.poles for each in fractions_of(model)]))
+    return bool(np.any(poles[poles > 0.0] * max(record.duration for record in records) < 1.0))
+
+
+def begins_quietly(records: Sequence[Record]) -> bool:
+    """Return whether records begin at rest: with constant inputs, longer than they are later, and constant outputs."""
+    return all(_is_quiet(record) for record in records)
+
+
+def _is_quiet(record: Record) -> bool:
+    moves = [input_moves(each) for each in record.each_input]
+    changes = np.concatenate([one.changes for one in moves])
+    if any(one.kind == "continuous" for one in moves) or not changes.size:
+        return False
+    times = np.sort(changes)
+    if changes.size > FEW_CHANGES and times[0] - record.t[0] < LONGER * np.diff(times).max():
+        return False
+    y = record.y[record.valid]
+    before = y[record.t[record.valid] < changes.min()]
+    size = before.size // QUIET_BLOCKS
+    if size < QUIET_SIZE:
+        return False
+    blocks = before[before.size - size * QUIET_BLOCKS :].reshape(QUIET_BLOCKS, size)
+    means, inner = blocks.mean(axis=1), blocks - blocks.mean(axis=1, keepdims=True)
+    if np.ptp(means) < QUIET_SHARE * float(y.std()):
+        return True
+    variance = float(np.sum(inner**2)) / (QUIET_BLOCKS * (size - 1))
+    # The variance of a mean of autoregressive noise of order 1 is (1 + r)/(1 - r) times that of white noise.
+    together = float(np.sum(inner[:, 1:] * inner[:, :-1])) / max(float(np.sum(inner**2)), np.finfo(float).tiny)
+    factor = (1.0 + max(together, 0.0)) / max(1.0 - together, 0.05)
+    return bool(np.ptp(means) < QUIET_ERRORS * np.sqrt(factor * variance / size))
 
 
 def excited_after(records: Sequence[Record], delay: float) -> bool:

@@ -83,6 +83,12 @@ def of_setting(models: Ranking, name: str) -> str:
     return f"{name.capitalize()}: {models.best.value(name)} (--{name}); {fall}."
 
 
+def of_drift(ranking: Ranking) -> str:
+    """Describe a drift instead of an integrator."""
+    best, other = ranking.candidates
+    return f"Offset: drift (--offset), as a zero nearly cancels the integrator otherwise; {_lower(best, other)}."
+
+
 def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
     """Describe the structure and the range of the delay."""
     best = ranking.best

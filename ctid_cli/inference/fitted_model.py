@@ -57,6 +57,21 @@ class FittedModel(ABC):
     Times are in the unit of time of the record, frequencies in radians per that unit.
     """
 
+    def marks(self, time_unit: str = "s") -> list[str]:
+        """Return what the records do not determine in sentences; none unless a fit states any.
+
+        Parameters
+        ----------
+        time_unit : str, default "s"
+            Unit of time of the records.
+
+        Returns
+        -------
+        list of str
+            One sentence for each.
+        """
+        return []
+
     @abstractmethod
     def _estimated(self) -> Estimated:
         """Return the model and the joint distribution of its parameters."""
@@ -299,6 +314,7 @@ class FittedModel(ABC):
             f"{name} = {kind}(numerator, denominator, '{DELAYS[kind]}', delay, 'TimeUnit', '{unit}');",
             f"% covariance of the estimates of {', '.join(found.parametric.names)}:",
             *(f"%   {_row(row)}" for row in found.reported),
+            *(f"% {mark}" for mark in self.marks(time_unit)),
         ]
         return "\n".join(lines) + "\n"
 
@@ -347,7 +363,8 @@ class FittedModel(ABC):
                 f"{name} *= control.TransferFunction(*control.pade(delay, {pade}))  # the delay, approximately"
             )
         lines.append(f"# covariance of the estimates of {', '.join(found.parametric.names)}:")
-        return "\n".join([*lines, *(f"#   {_row(row)}" for row in found.reported)]) + "\n"
+        lines += [f"#   {_row(row)}" for row in found.reported]
+        return "\n".join([*lines, *(f"# {mark}" for mark in self.marks())]) + "\n"
 
 
 def _check_pade(order: int | None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 
 import numpy as np
@@ -31,6 +31,8 @@ def robust_deviation(x: Array) -> float:
 
 #: Half-width of a 95 % interval of a normal estimate [standard errors].
 NORMAL = normal_quantile()
+#: Mark of a quantity that the record does not determine.
+NOT_DETERMINED = "Not determined"
 #: Reason why a fit that ignores the loop of its record has no standard errors.
 BIASED = (
     "There are no standard errors: the input responds to the output through a loop that this fit ignores, and the "
@@ -53,6 +55,10 @@ class UncertainValue:
     status: str = "free"
     #: Why there is no standard error.
     reason: str = ""
+    #: Separate intervals, if there are several; ``low`` and ``high`` are then NaN.
+    intervals: tuple[tuple[float, float], ...] = ()
+    #: Values of an undetermined quantity that fit as well.
+    alternatives: tuple[float, ...] = ()
 
     @classmethod
     def symmetric(
@@ -67,6 +73,37 @@ class UncertainValue:
         """Return an estimate with the interval ``estimate -+ quantile standard_error``."""
         reach = quantile * standard_error
         return cls(name, estimate, standard_error, estimate - reach, estimate + reach, unit, reason=reason)
+
+    @property
+    def shown(self) -> float:
+        """The estimate; NaN if it is not determined, and therefore no result."""
+        return math.nan if self.is_undetermined else self.estimate
+
+    @property
+    def is_undetermined(self) -> bool:
+        """Whether the record does not determine it, so that its value is not a result."""
+        return self.status == "undetermined"
+
+    def undetermined(self, reason: str, alternatives: tuple[float, ...] = ()) -> UncertainValue:
+        """Return it as not determined."""
+        return replace(
+            self,
+            standard_error=math.nan,
+            low=math.nan,
+            high=math.nan,
+            status="undetermined",
+            reason=reason,
+            alternatives=alternatives,
+        )
+
+    def with_intervals(self, intervals: tuple[tuple[float, float], ...]) -> UncertainValue:
+        """Return it with other intervals; the standard error is scaled with the length of a single one."""
+        if len(intervals) > 1:
+            return replace(self, standard_error=math.nan, low=math.nan, high=math.nan, intervals=intervals)
+        ((low, high),) = intervals
+        half, length = 0.5 * (self.high - self.low), 0.5 * (high - low)
+        error = self.standard_error * length / half if half > 0.0 else math.nan
+        return replace(self, standard_error=error, low=low, high=high)
 
     @property
     def relative_percent(self) -> float:

@@ -81,10 +81,11 @@ class ModelComparison(Result):
             Column("initial_state", "initial state"),
             Column("offset"),
         )
+        marks = [f"{row['name']}: {' '.join(row['marks'])}" for row in rows if row["marks"]]
         best_first = sorted(rows, key=lambda row: -row["fit_percent"])
         return [
             Section(sentences=[f"{samples}{one.t[-1]:.6g} {unit.time}."]),
-            Section(table=Table.of(best_first, columns), notes=[MEANING], drawing=self.drawing()),
+            Section(table=Table.of(best_first, columns), notes=[*marks, MEANING], drawing=self.drawing()),
         ]
 
     def _rows(self) -> list[dict[str, Any]]:
@@ -95,6 +96,7 @@ class ModelComparison(Result):
                 "file": str(fit.path),
                 **picked(one, ("fit_percent", "r2", "rms")),
                 "samples": one.count,
+                "marks": fit.result.marks(self.units.time),
                 **picked(one, ("initial_state", "offset")),
                 **(dict.fromkeys(VERDICTS) if one.tests is None else picked(one.tests, VERDICTS)),
             }

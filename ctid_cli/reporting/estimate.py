@@ -62,7 +62,7 @@ def _delay_status(delay: float | None, bounds: Sequence[float] | None) -> str:
 #: Reported fields of a parameter.
 PARAMETER = (
     Column("name", "parameter"),
-    Column("estimate"),
+    Column("shown", "estimate"),
     Column("standard_error", "std error", ".3g"),
     Column("relative_percent", "rel. %", ".2g"),
     Column("low", "95 % low", ".5g"),
@@ -73,5 +73,12 @@ PARAMETER = (
 
 
 def parameter_rows(found: Iterable[UncertainValue]) -> list[dict[str, Any]]:
-    """Return parameters as data."""
-    return [picked(item, [column.key for column in PARAMETER]) for item in found]
+    """Return parameters as data; an undetermined one has no estimate."""
+    return [rows_of(item, [column.key for column in PARAMETER]) for item in found]
+
+
+def rows_of(item: UncertainValue, keys: Iterable[str]) -> dict[str, Any]:
+    """Return fields of a quantity as data, with separate intervals and alternatives if it has any."""
+    found = {"estimate" if key == "shown" else key: value for key, value in picked(item, keys).items()}
+    more = {"intervals": [list(pair) for pair in item.intervals], "alternatives": list(item.alternatives)}
+    return found | {key: own for key, own in more.items() if own}

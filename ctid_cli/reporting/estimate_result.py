@@ -63,6 +63,7 @@ class EstimateResult(Result):
         row, seed = self.row, self.stored.manifest["seed"]
         head = [f"{row['estimator']} ({row['kind']}), data set {row['replicate']}{_start(row)}"]
         head.append(f"{row['status']}: {row['message']}")
+        head += [row["marks"]] * bool(row.get("marks"))
         if row.get("converged") is not None:
             head.append("It meets the success rule." if row["converged"] else "It does not meet the success rule.")
         numbers = [self._fitted(), _facts(row)]

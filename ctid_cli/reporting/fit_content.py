@@ -22,7 +22,7 @@ from ctid_cli.inference.noise_estimate import NoiseEstimate
 from ctid_cli.inference.units import Units
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.document import Column
-from ctid_cli.reporting.estimate import parameter_rows
+from ctid_cli.reporting.estimate import parameter_rows, rows_of
 from ctid_cli.reporting.layout import picked
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.measurement import Measurement
@@ -31,7 +31,7 @@ from ctid_cli.signals.record import Record
 #: Reported fields of a derived quantity.
 DERIVED = (
     Column("name", "derived"),
-    Column("estimate"),
+    Column("shown", "estimate"),
     Column("standard_error", "std error", ".3g"),
     Column("low", "95 % low"),
     Column("high", "95 % high"),
@@ -67,7 +67,9 @@ def fit_content(
         "choices": fitted.choices,
         "warnings": fitted.warnings,
         "notes": [note for measurement in measurements for note in measurement.notes],
-        "derived": [picked(row, DERIVED_KEYS) for row in derived_of(fitted, units)],
+        "derived": [rows_of(row, DERIVED_KEYS) for row in derived_of(fitted, units)],
+        "marks": fitted.marks(units.time),
+        "equivalents": [asdict(each) for each in fit.equivalents],
         "answer": picked(fitted.answer, ("seen", "p_value", "explained", "by_chance")),
         "covariance": _covariance_object(fitted),
         "delay_interval": "profile likelihood" if fitted.delay_interval is not None else "quadratic",

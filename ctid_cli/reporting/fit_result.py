@@ -172,13 +172,13 @@ class FitResult(PagedResult):
 
     def parameters(self) -> Section:
         """Return the parameters with their uncertainty."""
-        notes = [f"{self.fitted.errors_sentence} {form_of(self.fitted.fit)}"]
+        notes = [*self.fitted.marks(self.units.time), f"{self.fitted.errors_sentence} {form_of(self.fitted.fit)}"]
         return Section(table=Table.of(parameters_of(self.fitted, self.units), PARAMETER), notes=notes)
 
     def derived(self) -> Section:
         """Return derived quantities as a table, and why some have no error."""
         rows = derived_of(self.fitted, self.units)
-        notes = list(dict.fromkeys(row.reason for row in rows if row.reason))
+        notes = list(dict.fromkeys(row.reason for row in rows if row.reason and not row.is_undetermined))
         below = [row.name for row in rows if POSITIVE.search(row.name) and row.low < 0.0]
         if below:
             notes.append(

@@ -328,8 +328,9 @@ def _record_sections(results: Results) -> list[Section]:
     table = pd.DataFrame(columns).reindex(pd.MultiIndex.from_tuples(lines, names=["", "unit"])).fillna("-")
     blocks = [table[some] for some in _blocks([*table], ESTIMATES_PER_BLOCK)]
     sections = [Section(table=Table.of_frame(block[(block != "-").any(axis=1)].reset_index())) for block in blocks]
+    marks = [f"{title}: {row['marks']}" for title, row in zip(columns, rows, strict=True) if row.get("marks")]
     foot = "± is one standard error. Fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x."
-    return [Section(results.experiment), *sections, Section(notes=[foot])]
+    return [Section(results.experiment), *sections, Section(notes=[*marks, foot])]
 
 
 def _with_error(item: UncertainValue) -> str:

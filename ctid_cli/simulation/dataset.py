@@ -129,6 +129,7 @@ class DataSet:
             "covariance": "" if law is None else law.kind,
             "degrees_of_freedom": law.degrees_of_freedom if law and law.kind in ("white", "robust") else None,
             "quantiles": {name: quantiles[name] for name, error in errors.items() if np.isfinite(error)} or None,
+            "marks": " ".join(fit.marks()) if hasattr(fit, "marks") else "",
             "cost": fit.cost,
             "fit_percent": fit.fit_percent,
             "validation_fit_percent": _fit_percent(model, self.validation, "y"),

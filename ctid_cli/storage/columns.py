@@ -105,6 +105,11 @@ COLUMNS = (
         of="systems",
         prefix="quantile_",
     ),
+    Column(
+        *("marks", "str"),
+        "what the record does not determine, and the models that a repeating input cannot tell apart",
+        of="systems",
+    ),
     Column("cost", "float64", "mean squared output error", "output unit^2", of="systems"),
     Column("fit_percent", "float64", "fit on the record that was estimated from", "%", of="systems"),
     Column("validation_fit_percent", "float64", "fit on the rest of a measured record", "%", of="systems"),

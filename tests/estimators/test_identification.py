@@ -163,8 +163,8 @@ def test_without_a_response_the_first_warning_says_so():
     assert identify([record], OPTIONS).answer.p_value == 0.005
 
 
-def test_a_pole_at_the_border_is_held_and_the_others_have_standard_errors():
-    """They are those of the model with the free pole and the numerator, from central differences."""
+def test_a_pole_at_the_border_is_held_and_what_only_reflects_it_is_not_determined():
+    """The covariance is that of the model with the free pole and the numerator, from central differences."""
     record = record_of(TransferFunction([1.0], [1.0, 2.0]), n=400, seed=3)
     result = identify([record], DelayProfile(2, 1, (0, 0)), covariance="white")
     slow, free = LIMITS["slowest"].rest / record.t[-1], float(result.fit.model.poles.real.min())
@@ -179,10 +179,13 @@ def test_a_pole_at_the_border_is_held_and_the_others_have_standard_errors():
     psi = np.column_stack([(output(*(point + h)) - output(*(point - h))) / (2 * h.sum()) for h in steps])
     squared = np.sum((record.y - output(*point)) ** 2)
     errors = np.sqrt(np.diag(np.linalg.inv(psi.T @ psi)) * squared / (400 - 3))
+    numerator = [result.fit.parameter_names.index(name) for name in ("b0", "b1")]
+    assert np.sqrt(np.diag(result.uncertainty.covariance))[numerator] == pytest.approx(errors[1:], rel=1e-4)
     rows = {row.estimate: row for row in result.derived}
-    assert rows[free].standard_error == pytest.approx(errors[0], rel=1e-4)
-    assert [by_name(result)[name].standard_error for name in ("b0", "b1")] == pytest.approx(errors[1:], rel=1e-4)
-    assert all(item.status == "free" for item in result.estimates[:4])
+    # Intervals contain those of models with a faster slow pole, which the record does not reject.
+    assert rows[free].standard_error >= errors[0] * (1 - 1e-4)
+    assert by_name(result)["b0"].standard_error >= errors[1] * (1 - 1e-4)
+    assert by_name(result)["a2"].status == rows[result.fit.model.dc_gain].status == "undetermined"
     held = min(rows.values(), key=lambda row: abs(row.estimate + slow))
     assert np.isnan(held.standard_error)
     assert "bound" in held.reason

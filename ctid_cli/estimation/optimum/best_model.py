@@ -177,9 +177,10 @@ def best_local(
     starts: Sequence[Begin],
     *,
     known: KnownCoefficients = NOTHING,
+    box: Box | None = None,
 ) -> Optimum:
     """Return the least sum of squared output errors in the basins of denominators and delays."""
-    box = _box(problem, delays, known)
+    box = box or _box(problem, delays, known)
     search = StructureSearch(problem, box, known=known)
     search.refine(poles, problem.zeros, _met([_point(start, box) for start in starts], box, known))
     return _least(search, poles, problem.zeros, False)
