@@ -69,14 +69,14 @@ def misses(intervals, truth):
 def equivalent(case, found, printed):
     """Return the true quantities, for a stated repetition those of the equivalent model of nearest delay."""
     truth = quantities(unpacked(packed(case.systems), case.systems))
-    repetition = getattr(found, "repetition", None)
-    for name in case.systems if repetition is not None else ():
-        if name and name not in case.repeats:
+    for each in getattr(found.fit, "equivalents", ()):
+        if each.input and each.input not in case.repeats:
             continue
-        delay, gain = (f"{name}_{each}" if name else each for each in ("delay", "static_gain"))
-        times = round((printed[delay].estimate - truth[delay]) / repetition.shift)
-        truth[delay] += times * repetition.shift
-        truth[gain] *= repetition.sign ** abs(times)
+        delay, gain = (f"{each.input}_{one}" if each.input else one for one in ("delay", "static_gain"))
+        shift = abs(each.delay - printed[delay].estimate)
+        times = round((printed[delay].estimate - truth[delay]) / shift)
+        truth[delay] += times * shift
+        truth[gain] *= each.sign ** abs(times)
     return truth
 
 

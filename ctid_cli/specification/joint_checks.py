@@ -44,7 +44,7 @@ TIME_CONSTANTS = 3.0
 #: Input edges within this fraction of the sampling interval of a sample count as simultaneous with it.
 ON_TIME = 1e-6
 #: Warning about an option without an effect.
-FORMER = "is an option of earlier versions and has no effect; only estimates stored with it are still found by it"
+FORMER = "has no effect any more; it only keeps the ids of estimates that were stored with it"
 #: Success rules of systems and of signals.
 _RULES_OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
 _RULES_OF_SIGNALS = ("band", "by", "window")
