@@ -211,7 +211,9 @@ class Prepared(Generic[LaidOut, AnyFit]):
             law = fit.law.in_ignored_loop
             covariance = fit.covariance if law is fit.law else np.full_like(fit.covariance, np.nan)
             fit = replace(fit, law=law, covariance=covariance)
-        return replace(fit, in_ignored_loop=True)
+        fit = replace(fit, in_ignored_loop=True)
+        none: dict[str, Any] = {"intervals": {}, "undetermined": {}} if hasattr(fit, "intervals") else {}
+        return replace(fit, **none)
 
 
 # --- options ---------------------------------------------------------------------------------------

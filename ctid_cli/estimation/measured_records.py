@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
-from ctid_cli.errors import DataError
+from ctid_cli.errors import CtidError, DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record
 from ctid_cli.estimation.optimum.best_model import (
     Begin,
@@ -43,7 +43,7 @@ from ctid_cli.estimation.record_preparation import (
 )
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
 from ctid_cli.inference.innovations import sampled
-from ctid_cli.inference.repetition import Equivalent, Repetition, repetitions_of
+from ctid_cli.inference.repetition import Equivalent, Repetition, repetitions_of, without_level
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.sensitivities import Structure, SumStructure
 from ctid_cli.models.additive import AdditiveModel
@@ -52,8 +52,8 @@ from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, Offset, OutputHold
 
-#: Level of an input, relative to its deviation, and difference of shifts, relative to them, that count as zero.
-SAME_LEVEL = 1e-3
+#: Difference of a delay from a shift, relative to it, that counts as zero.
+SAME_SHIFT = 1e-3
 #: Distance below the range of a delay, as a share of a shift, from which its lower bound is tried.
 BELOW = 0.25
 #: Excess of the squared error, in units of the noise variance, that rejects a model: 95 % of chi-square with one
@@ -215,10 +215,9 @@ class MeasuredRecords:
             for record in self.records if low < high and not known else ():
                 signal = list(record.held.values())[k]
                 period = period_of(record) if treatment.initial_state == "periodic" else None
-                tolerance = SAME_LEVEL * float(np.std(signal.values))
-                all_of = repetitions_of(signal, float(record.t[-1]), period)
-                of_records.append([one for one in all_of if treatment.offset != "none" or abs(one.level) <= tolerance])
-            first, *others = of_records or [[]]
+                all_of = repetitions_of(signal, record.t, period)
+                of_records.append(all_of if treatment.offset != "none" else without_level(all_of, signal))
+            first, *others = of_records or [()]
             found.append(tuple(one for one in first if all(any(map(one.agrees, other)) for other in others)))
         return tuple(found)
 
@@ -234,7 +233,7 @@ class MeasuredRecords:
                     trial = self.local((found.start[0], tuple(delays)))
                     if trial.delays[k] >= found.delays[k] or not self.as_good(trial, found):
                         break
-                    found = replace(trial, tried=found.tried, agree=found.agree)
+                    found = replace(trial, tried=found.tried, agree=found.agree, others=found.others)
         return found
 
     def as_good(self, one: Optimum, other: Optimum) -> bool:
@@ -256,13 +255,14 @@ class MeasuredRecords:
         """Return the delay of an equivalent of a model; None if the samples after both delays distinguish them."""
         assert isinstance(begin[1], tuple)
         delays = list(begin[1])
-        delay = delays[k] + one.shift * (1 if delays[k] < one.shift * (1 - SAME_LEVEL) else -1)
-        if one.exact:
+        delay = max(delays[k] + one.shift * (1 if delays[k] < one.shift * (1 - SAME_SHIFT) else -1), 0.0)
+        # A shift of the input of an integrator changes its output by a constant.
+        if one.exact and not (any(self.treatment.integrators) and self.treatment.offset == "none"):
             return delay
         treatment, bounds = self.treatment, list(each_bounds(self.treatment.delay_bounds))
         bounds[k] = min(delay, delays[k]), max(delay, delays[k])
         offset: Offset = "none" if treatment.offset == "remove" else treatment.offset
-        with suppress(DataError):
+        with suppress(CtidError, np.linalg.LinAlgError):
             own = treatment._replace(
                 delay_bounds=tuple(bounds), initial_state="estimate", offset=offset, input_before=None, bridge=False
             )

@@ -373,7 +373,7 @@ class DelayProfile(RecordsEstimator):
         known, degrees = self._known(names) if self.fixed else {}, self._degrees(names, free=False)
         search = BoundedSearch(measured, self._quantities(names), degrees, known)
         found, ends = search.within(measured.best())
-        fit = fitted(measured, found, None)
+        fit = replace(fitted(measured, found, None), other_minima=())
         if not ends:
             return fit
         layout = measured.layout_of(fit.model)

@@ -32,7 +32,7 @@ from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.parameter_layout import Degrees
 from ctid_cli.estimators.measured_fit import MeasuredFit, delay_names, fitted
 from ctid_cli.inference.criteria import squared_innovations
-from ctid_cli.inference.intervals import NOT_DETERMINED, CostOfDelay, UncertainValue
+from ctid_cli.inference.intervals import NOT_DETERMINED, CostOfDelay, UncertainValue, student_quantile
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
 from ctid_cli.inference.sensitivities import SumStructure
 from ctid_cli.inference.uncertainty import Uncertainty
@@ -59,7 +59,7 @@ OTHER_MINIMA = f"{NOT_DETERMINED}: other minima fit as well."
 AT_OUR_BOUND = f"{NOT_DETERMINED}: a pole is at the bound of the admissible models, which it reflects."
 #: Difference of two delays from a multiple of a shift, as a share of it, up to which they are equivalent.
 SAME_SHIFT = 0.05
-#: Confidence level of the intervals.
+#: Confidence level of intervals and tests.
 LEVEL = 0.95
 
 
@@ -72,13 +72,22 @@ class Accepted(NamedTuple):
     rise: float
 
 
+class AtBound(NamedTuple):
+    """Model with a pole at a bound of the admissible set, and one beside it, where the pole is inside."""
+
+    here: Accepted
+    inside: Accepted
+    #: Whether the pole is at the slow bound, else at the fast one.
+    slow: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Determination:
     """Models that records do not reject, in chains of neighbouring ones; the first begins with the estimate."""
 
     chains: tuple[tuple[Accepted, ...], ...]
     #: Neighbouring models at a bound of a pole, the first at the bound; the end of the interval is ours.
-    at_our_bound: tuple[tuple[Accepted, Accepted], ...] = ()
+    at_our_bound: tuple[AtBound, ...] = ()
 
     @property
     def trivial(self) -> bool:
@@ -93,7 +102,7 @@ class Determination:
             return found
         others = {
             id(each.fit): {item.name: item for item in values(each.fit, each.law)}
-            for chain in (*self.chains, *self.at_our_bound)
+            for chain in (*self.chains, *(pair[:2] for pair in self.at_our_bound))
             for each in chain
         }
         return [self._reported(item, others) for item in found]
@@ -101,8 +110,8 @@ class Determination:
     def _reported(self, item: UncertainValue, of: Mapping[int, Mapping[str, UncertainValue]]) -> UncertainValue:
         if item.status in ("fixed", "undetermined"):
             return item
-        ends = [[of[id(each.fit)].get(item.name) for each in pair] for pair in self.at_our_bound]
-        if any(_reflects(*pair, ends_of) for pair, ends_of in zip(self.at_our_bound, ends, strict=True)):
+        ends = [[of[id(each.fit)].get(item.name) for each in pair[:2]] for pair in self.at_our_bound]
+        if any(_reflects(pair, own) for pair, own in zip(self.at_our_bound, ends, strict=True)):
             return item.undetermined(AT_OUR_BOUND)
         if item.reason:
             return item
@@ -135,26 +144,22 @@ def _interval(item: UncertainValue, rise: float) -> tuple[float, float]:
     return item.estimate - share * (item.estimate - item.low), item.estimate + share * (item.high - item.estimate)
 
 
-def _reflects(here: Accepted, inside: Accepted, items: Sequence[UncertainValue | None]) -> bool:
+def _reflects(pair: AtBound, items: Sequence[UncertainValue | None]) -> bool:
     """Return whether a quantity follows a pole at its bound."""
     if items[0] is None or items[1] is None:
         return False
     values = np.array([items[0].estimate, items[1].estimate])
-    moved = float(np.abs(np.log(_size_of_pole(here.fit, inside.fit))))
-    if not np.isfinite(values).all() or not moved > 0.0:
-        return not np.isfinite(values).all()
-    if values[0] == values[1]:
+    moved = float(np.abs(np.log(_size_of_pole(pair))))
+    if not np.isfinite(values).all() or not moved > 0.0 or values[0] == values[1]:
         return False
     return bool(values.prod() <= 0.0 or abs(np.log(values[0] / values[1])) > REFLECTS * moved)
 
 
-def _size_of_pole(here: MeasuredFit, inside: MeasuredFit) -> float:
+def _size_of_pole(pair: AtBound) -> float:
     """Return the ratio of the magnitudes of the pole at its bound in two models."""
-    held = np.abs(np.asarray(here.held_poles))
-    poles, others = (np.sort(np.abs(fit.model.poles)) for fit in (here, inside))
-    poles, others = poles[poles > 0.0], others[others > 0.0]
-    slow = bool(held.min() <= poles.min() * (1 + 1e-6))
-    return float(poles[0] / others[0]) if slow else float(poles[-1] / others[-1])
+    poles, others = (np.sort(np.abs(each.fit.model.poles)) for each in pair[:2])
+    k = 0 if pair.slow else -1
+    return float(poles[poles > 0.0][k] / others[others > 0.0][k])
 
 
 def _merged(intervals: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
@@ -187,10 +192,13 @@ def determination_of(
     if not limit.allowed > 0.0:
         return alone
     first = [alone.chains[0][0]]
-    for k in _uncertain_delays(fit, law, near):
-        first += limit.along_delay(near, k)
     for optima in inside:
         first += [each for each in limit.towards(near, optima) if each.rise < 1.0]
+    if fit.bounds_met:
+        # Beyond a given bound the squared error is lower: other searches would leave it.
+        return Determination((tuple(first),))
+    for k in _uncertain_delays(fit, law, near):
+        first += limit.along_delay(near, k)
     others = list[tuple[Accepted, ...]]()
     for each in limit.others(near):
         between = limit.between(near, each)
@@ -198,14 +206,14 @@ def determination_of(
             others.append((each,))
         else:
             first += [*between, each]
-    pairs = []
+    pairs = list[AtBound]()
     for end in (_slow_end, _fast_end):
         # Of the models that are not rejected, the first that has a pole at this end.
         for at_end in (*first, *(each for chain in others for each in chain)):
             models = list(limit.towards(near, end(at_end.fit, near)))
             if models:
                 first += [each for each in models if each.rise < 1.0]
-                pairs.append((at_end, models[0]))
+                pairs.append(AtBound(at_end, models[0], end is _slow_end))
                 break
     return Determination((tuple(first), *others), tuple(pairs))
 
@@ -215,10 +223,9 @@ class _Limit:
 
     def __init__(self, fit: MeasuredFit, law: Uncertainty) -> None:
         self.fit, self.law, self.linear = fit, law, fit.linear
-        self.freedom = fit.count - law.free_covariance.shape[0]
-        size = fit.theta.size
-        self.reach = law.quantile(np.eye(size)[0] if size else np.zeros(0), LEVEL)
-        self.allowed = self.reach**2 / self.freedom if self.freedom > 0 else 0.0
+        self.freedom = self.linear.count - law.free_covariance.shape[0]
+        reach = student_quantile(law.degrees_of_freedom, LEVEL)
+        self.allowed = reach**2 / self.freedom if self.freedom > 0 else 0.0
         self.coloured = law.kind != "white" and fit.noise is None
 
     @cached_property
@@ -248,7 +255,7 @@ class _Limit:
 
     def rise(self, found: Optimum, inflation: float = 1.0) -> float:
         """Return the rise of the squared error of a minimum as a share of the allowed one."""
-        least = self.linear.cost * self.fit.count
+        least = self.linear.cost * self.linear.count
         return max(found.squared_error / least - 1.0, 0.0) / (inflation * self.allowed) if least > 0 else np.inf
 
     def whitened_rise(self, other: MeasuredFit) -> float:
@@ -258,7 +265,7 @@ class _Limit:
             squared_innovations(each.residuals, [psi @ each.tangent for psi in each.sensitivities], noise)
             for each in (self.linear, other.linear)
         ]
-        return max(both[1] / both[0] - 1.0, 0.0) / self.allowed
+        return max(both[1] / both[0] - 1.0, 0.0) / self.allowed if both[0] > 0.0 else np.inf
 
     def others(self, near: MeasuredRecords) -> Iterator[Accepted]:
         """Yield other minima of the search that are not rejected."""
@@ -288,6 +295,9 @@ class _Limit:
 
     def between(self, near: MeasuredRecords, other: Accepted) -> list[Accepted] | None:
         """Return minima at delays between those of the estimate and of another minimum; None if one is rejected."""
+        # Without another delay nothing connects them.
+        if delays_of(self.fit.model) == delays_of(other.fit.model):
+            return None
         start, stop = (np.array(delays_of(each.model)) for each in (self.fit, other.fit))
         found = list[Accepted]()
         for delays in np.linspace(start, stop, DELAYS)[1:-1].tolist():
@@ -312,10 +322,11 @@ class _Limit:
     @cached_property
     def inflation(self) -> float:
         """Median factor by which coloured noise increases the variances of the parameters."""
-        if self.law.kind == "white":
-            return 1.0
         white = np.diag(self.linear.uncertainty("white").free_covariance)
-        return max(1.0, float(np.median(np.diag(self.law.free_covariance) / white)))
+        if self.law.kind == "white" or not (white > 0.0).any():
+            return 1.0
+        ratios = np.diag(self.law.free_covariance)[white > 0.0] / white[white > 0.0]
+        return max(1.0, float(np.median(ratios)))
 
 
 def _same(one: MeasuredFit, other: MeasuredFit) -> bool:
@@ -407,13 +418,15 @@ def _slow_end(fit: MeasuredFit, near: MeasuredRecords) -> Iterator[Optimum]:
 
 def _fast_end(fit: MeasuredFit, near: MeasuredRecords) -> Iterator[Optimum]:
     """Yield minima with ever slower fastest poles, from one at the fast bound."""
-    if fit.box is None:
+    if fit.box is None or near.problem.terms:
         return
     fast = [pole for pole in fit.held_poles if abs(pole) >= fit.box.fastest * (1 - 1e-6)]
     begin = near.begin(fit.parametrised) if fast else None
     for step in LOGARITHMS if fast else ():
         box = replace(fit.box, fastest=fit.box.fastest * float(np.exp(-step)))
         assert begin is not None
+        if box.fastest <= box.slowest:
+            return
         with suppress(CtidError, np.linalg.LinAlgError):
             found = near.local(begin, box=box)
             begin = found.start

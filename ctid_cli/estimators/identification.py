@@ -16,7 +16,7 @@ from ctid_cli.estimation.optimum.box import each_bounds
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, RecordsEstimator
-from ctid_cli.estimators.determination import cost_of_delay
+from ctid_cli.estimators.determination import LEVEL, cost_of_delay
 from ctid_cli.estimators.frequency_domain import (
     FrequencyDomain,
     FrequencyDomainFit,
@@ -27,7 +27,6 @@ from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopFit, LoopOutp
 from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit, pieces_text
 from ctid_cli.estimators.measured_submodels import LaidOutSubmodels, MeasuredSubmodels, SubmodelsFit
 from ctid_cli.estimators.reported_parameters import (
-    LEVEL,
     determined,
     free_directions,
     reported_parameters,
@@ -164,7 +163,8 @@ class Identification(DeferredFields, FittedModel, Shown):
             One sentence for each; empty if there is nothing to say.
         """
         items = (*self.estimates, *self.derived)
-        found = replace(self.fit, undetermined={}, intervals={}).marks(time_unit)
+        shown = self.fit.equivalents if self.answer.seen else ()
+        found = replace(self.fit, undetermined={}, intervals={}, equivalents=shown).marks(time_unit)
         reasons: dict[str, list[str]] = {}
         for item in items:
             if item.is_undetermined:

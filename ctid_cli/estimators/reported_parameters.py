@@ -10,7 +10,7 @@ import numpy as np
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import Optimum
-from ctid_cli.estimators.determination import Accepted, Determination, cost_of_delay, determination_of
+from ctid_cli.estimators.determination import LEVEL, Accepted, Determination, cost_of_delay, determination_of
 from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit, delay_names
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
@@ -18,9 +18,6 @@ from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.intervals import BIASED, DelayInterval, UncertainValue
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.several_inputs import delays_of
-
-#: Confidence level of intervals and tests.
-LEVEL = 0.95
 
 
 class ReportedParameters(NamedTuple):

@@ -189,10 +189,13 @@ class Structures:
         if SAMPLES_PER_PARAMETER * size > sum(data.count for data in laid_out.data):
             return None
         near = None if self.near is None or options.bounds else self.near(poles, zeros)
-        if near is None:
-            fit = options._minimum(laid_out, None)
-        else:
-            fit = fitted(laid_out, laid_out.local(laid_out.begin(near)), None)
+        try:
+            if near is None:
+                fit = options._minimum(laid_out, None)
+            else:
+                fit = fitted(laid_out, laid_out.local(laid_out.begin(near)), None)
+        except DataError:
+            return None
         self.found[poles, zeros] = Candidate(options, self.hold, fit, size)
         return self.found[poles, zeros]
 

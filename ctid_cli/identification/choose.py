@@ -313,7 +313,7 @@ class _Choosing:
             settings = with_offsets(settings, self.part)
         ranking = self._with_needed_drift(models, models.compared(settings))
         self._note(ranking)
-        self.models, best = models, self._treated(ranking, delays[1])
+        self.models, best = models, self._treated(ranking, self._longest(delays[1]))
         setting = Setting(self.first_hold, best.initial_state, best.input_before, best.offset)
         self.gains = gains_of_treatments(ranking)
         holds = self._holds()
@@ -380,7 +380,11 @@ class _Choosing:
         """Return the records with the samples that all settings can use."""
         if all(setting.initial_state != "estimate" for setting in settings):
             return self.part
-        return without_beginning(self.part, latest)
+        return without_beginning(self.part, self._longest(latest))
+
+    def _longest(self, latest: float) -> float:
+        """Return the greatest delay of all inputs [s]."""
+        return max([latest, *(one.delay_bounds[1] for one in self.several.inputs or () if one.delay_bounds)])
 
 
 def _rounded(delay: float) -> float:

@@ -32,7 +32,7 @@ def joined_with_holds(found: Identification, choice: Choice) -> Identification:
     A signal of straight lines leads that of constant values by half a sampling interval.
     """
     options = choice.options
-    for hold in choice.holds if isinstance(options, DelayProfile) else ():
+    for hold in choice.holds if isinstance(options, DelayProfile) and not options.bounds else ():
         laid_out = options.prepare([with_hold(record, hold) for record in choice.records]).laid_out
         text = JOINED_HOLDS.format(hold if isinstance(hold, str) else ", ".join(hold))
         found = _joined_with(found, laid_out, laid_out.local(laid_out.begin(found.fit.model)), text)
@@ -45,9 +45,13 @@ def joined_with_larger(found: Identification, choice: Choice) -> Identification:
     The criterion may choose a pole too few, whose effect then is a part of the delay.
     """
     larger = _larger(choice)
-    if larger is None or not isinstance(larger.options, DelayProfile):
+    if larger is None or not (isinstance(larger.options, DelayProfile) and isinstance(choice.options, DelayProfile)):
         return found
-    laid_out = larger.options.prepare(choice.fitted).laid_out
+    if choice.options.bounds:
+        return found
+    own = larger.options
+    options = replace(choice.options, poles=own.poles, zeros=own.zeros, inputs=own.inputs, fixed=None)
+    laid_out = options.prepare(choice.records).laid_out
     minimum = laid_out.with_least_delays(laid_out.local(laid_out.begin(larger.fit.model)))
     return _joined_with(found, laid_out, minimum, JOINED)
 
@@ -105,6 +109,7 @@ def _joined(item: UncertainValue, other: UncertainValue | None) -> UncertainValu
         for pair in (each.intervals or ((each.low, each.high),))
         if np.isfinite(pair).all()
     ]
-    if len(pairs) < 2 or not np.isfinite([item.low, item.high]).all():
+    given = bool(item.intervals) or bool(np.isfinite([item.low, item.high]).all())
+    if len(pairs) < 2 or not given:
         return item
     return item.with_intervals(((min(low for low, _ in pairs), max(high for _, high in pairs)),))

@@ -38,7 +38,7 @@ Searched = DelayProfile | AdditiveOutputError
 #: 1.25 times the error of the true structure in 87 %, with BIC itself in 84 %.
 PENALTY = 1.5
 #: Options of the treatment of records, and increase of the criterion from which one is rejected.
-TREATMENT, REJECTED = ("initial_state", "input_before", "offset"), 10.0
+TREATMENT, CLEARLY_WORSE = ("initial_state", "input_before", "offset"), 10.0
 #: Increase of the criterion up to which models with equal parameters are likely: 95 % of chi-square with one degree of
 #: freedom.
 LIKELY = 3.84
@@ -168,10 +168,10 @@ def without_needless_drift(ranking: Ranking) -> Ranking:
 
 
 def gains_of_treatments(ranking: Ranking) -> dict[str, tuple[float, ...]]:
-    """Return the static gains of treatments of the records within ``REJECTED`` of the best, if their signs differ."""
+    """Return the static gains of treatments that are not clearly worse than the best, if their signs differ."""
     best_of: dict[tuple[object, ...], Candidate] = {}
     for each in ranking.candidates:
-        if each.is_admissible and each.criterion <= ranking.best.criterion + REJECTED:
+        if each.is_admissible and each.criterion <= ranking.best.criterion + CLEARLY_WORSE:
             best_of.setdefault(tuple(each.value(name) for name in TREATMENT), each)
     found: dict[str, list[float]] = {}
     for each in best_of.values():

@@ -103,7 +103,7 @@ def identify(
     found = identification.identify(choice.options, choice.records, None, *noise)
     found = replace(found, choices=choice.sentences)
     found = joined_with_holds(with_other_gains(found, choice), choice)
-    if not (isinstance(given.poles, int) and isinstance(given.zeros, int)):
+    if not (given.typed or (isinstance(given.poles, int) and isinstance(given.zeros, int))):
         found = joined_with_larger(found, choice)
     if other is not None:
         found = replace(found, validation=validated_on(other, choice.options, found.fit, given))

@@ -53,7 +53,7 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain | 
     prepared = options.prepare(data)
     minimum = prepared.minimum()
     law = minimum.uncertainty("auto")
-    fit, found = determined(minimum._with_law(law), prepared.laid_out)
+    fit, found = determined(minimum._with_law(law), prepared.laid_out, options._inside(minimum, prepared.laid_out))
     assert isinstance(fit, FrequencyDomainFit)
     (residuals,), (values,) = fit.residuals, prepared.laid_out.outputs
     response, free = _response_test(fit), free_directions(fit)[0]

@@ -12,7 +12,7 @@ from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import Candidate
 from ctid_cli.inference.input_response import analyse_response
 from ctid_cli.inference.noise_model import NoiseModel
-from ctid_cli.inference.repetition import range_of, repetitions_of
+from ctid_cli.inference.repetition import range_of, repetitions_of, without_level
 from ctid_cli.inference.residual_tests import chi_square_tail
 from ctid_cli.inference.signal_features import FEW_CHANGES, input_moves
 from ctid_cli.models.several_inputs import AnyModel, fractions_of
@@ -38,8 +38,9 @@ LIVELY = 0.5
 LATEST, LATE, FURTHER, REMAINING = 0.1, 1.5, 3, 0.9
 #: A response is seen where the output is this many deviations away from its level in a quiet beginning.
 ONSET = 5.0
-#: Longest range of the delay within one interval of a repeating input, as a share of the record.
-WHOLE = 0.999
+#: Longest range of the delay within one interval of a repeating input, as a share of the record: for a periodic state,
+#: and for others.
+WHOLE, SHARE = 0.999, 0.4
 #: Least time before the first of many changes of an input that shows rest, relative to the longest between two of them.
 LONGER = 1.2
 #: Blocks of the output before the first change of the input, and their least size. The output is constant if their
@@ -102,7 +103,8 @@ def _onset(record: Record) -> float:
     """Return the time from the first change of an input to the first response after a quiet beginning; 0 without."""
     if not _is_quiet(record):
         return 0.0
-    t, y, first = record.t[record.valid], record.y[record.valid], _first_change(record)
+    t, y = record.t[record.valid], record.y[record.valid]
+    first = min(float(input_moves(each).changes.min(initial=np.inf)) for each in record.each_input)
     before = y[t < first]
     away = np.abs(y - before.mean()) > max(ONSET * float(before.std()), QUIET_SHARE * float(y.std()))
     # Two samples in a row: one may be an outlier.
@@ -123,12 +125,15 @@ def distinguishable_delays(records: Sequence[Record], given: Given) -> float:
     if isinstance(given.input_before, float | int):
         return float("inf")
     periodic = given.initial_state == "periodic"
-    each = [
-        range_of(repetitions_of(record.input, float(record.t[-1]), period_of(record) if periodic else None))
-        for record in records
-    ]
+    shortest, each = min(record.duration for record in records), []
+    for record in records:
+        found = repetitions_of(record.input, record.t, period_of(record) if periodic else None)
+        each.append(range_of(without_level(found, record.input) if given.offset == "none" else found))
     longest = max(each)
-    return min(longest, *(WHOLE * record.duration for record in records)) if np.isfinite(longest) else longest
+    # With an estimated state the range of the delay costs as many samples.
+    if not np.isfinite(longest) or (longest > SHARE * shortest and not periodic):
+        return float("inf")
+    return min(longest, WHOLE * shortest)
 
 
 def is_slow(model: AnyModel, records: Sequence[Record]) -> bool:

@@ -103,7 +103,7 @@ class UncertainValue:
         ((low, high),) = intervals
         half, length = 0.5 * (self.high - self.low), 0.5 * (high - low)
         error = self.standard_error * length / half if half > 0.0 else math.nan
-        return replace(self, standard_error=error, low=low, high=high)
+        return replace(self, standard_error=error, low=low, high=high, intervals=())
 
     @property
     def relative_percent(self) -> float:

@@ -23,10 +23,14 @@ AWAY = 0.3
 #: Longest shift as a share of the record, for an exact repetition and for one with noise or displaced edges, which
 #: must be seen more often.
 LONGEST, LONGEST_ALIKE = 0.5, 1 / 3
+#: Level of an input, relative to its deviation, that counts as zero.
+SAME_LEVEL = 1e-3
 #: Relative difference of shifts that count as equal.
 SAME = 1e-2
 #: Largest number of parts of the least distance of two lines that is tried as their common divisor.
 MOST_PARTS = 4
+#: Fewest samples of a record whose input may repeat.
+FEWEST_SAMPLES = 8
 #: Fewest changes of an input that repeats.
 FEWEST_CHANGES = 4
 #: Points of the grid on which an input with an irregular clock is compared, for each of its breaks.
@@ -51,27 +55,38 @@ class Repetition:
         return self.sign == other.sign and abs(self.shift - other.shift) <= SAME * self.shift
 
 
-def repetitions_of(signal: HeldSignal, stop: float, period: float | None = None) -> tuple[Repetition, ...]:
-    """Return the repetitions of an input up to the last instant of its record, at most one of each sign.
+def repetitions_of(signal: HeldSignal, t: Array, period: float | None = None) -> tuple[Repetition, ...]:
+    """Return the repetitions of an input between the instants of its record, at most one of each sign.
 
     With a ``period`` [s] the input is known to repeat after it, before the record too.
     """
-    t = signal.t[signal.t <= stop]
-    interval = regular_interval(t)
-    step = float(stop - t[0]) / (FINER * t.size) if interval is None else interval
-    u = signal.at(t[0] + step * np.arange(int(np.floor((stop - t[0]) / step + 1e-6)) + 1))
     found = [] if period is None else [Repetition(period, 1)]
-    if np.count_nonzero(np.diff(u)) < FEWEST_CHANGES:
+    if t.size < FEWEST_SAMPLES:
+        return tuple(found)
+    interval, sampled = regular_interval(t), signal.values if np.array_equal(signal.t, t) else signal.at(t)
+    moved = np.append(sampled[1:] != sampled[:-1], False)
+    if np.count_nonzero(moved) < FEWEST_CHANGES:
         return tuple(found)
     # The edge of a sampled square wave is anywhere between the sample that shows it and the one before.
-    moved = np.append(signal.at(t[1:]) != signal.at(t[:-1]), False)
-    since = np.searchsorted(t, t[0] + step * np.arange(u.size) + signal.slack, side="right") - 1
-    away = 1.0 - moved[np.clip(since, 0, t.size - 1)] if 2 * np.count_nonzero(moved) < t.size else np.ones(u.size)
+    away = 1.0 - moved if 2 * np.count_nonzero(moved) < t.size else np.ones(t.size)
+    if interval is None:
+        step = float(t[-1] - t[0]) / (FINER * t.size)
+        grid = t[0] + step * np.arange(FINER * t.size + 1)
+        since = np.clip(np.searchsorted(t, grid + 1e-9 * step, side="right") - 1, 0, t.size - 1)
+        u, away = signal.at(grid), away[since]
+    else:
+        step, u = interval, sampled
     shorter = [each for sign in SIGNS if (each := _of_sign(u, away, step, sign)) is not None]
     found = [each for each in found if all(other.sign != each.sign for other in shorter)] + shorter
     # A whole period follows from half of one.
     half = min((each.shift for each in found if each.sign < 0 and each.exact), default=np.inf)
     return tuple(each for each in found if each.sign < 0 or each.shift < half)
+
+
+def without_level(repetitions: Sequence[Repetition], signal: HeldSignal) -> tuple[Repetition, ...]:
+    """Return the repetitions about a level of zero: another level changes the offset of the output."""
+    tolerance = SAME_LEVEL * float(np.std(signal.values))
+    return tuple(one for one in repetitions if abs(one.level) <= tolerance)
 
 
 def range_of(repetitions: Sequence[Repetition]) -> float:

@@ -37,6 +37,9 @@ def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None
     free = {name: "" for name in given if name not in (*named, "delay")}
     values |= {**given, "delay": delay}
     found = [_found(name, values[name], errors, unit) for name, unit in {**named, **free, "delay": units.time}.items()]
+    unknown = re.search(r"Not determined: ([^.:]*)", estimate.get("marks") or "")
+    names = set(re.split(", | and ", unknown[1])) if unknown else set()
+    found = [replace(one, status="undetermined") if one.name in names else one for one in found]
     return [*found[:-1], replace(found[-1], status="free" if "delay" in given else _delay_status(delay, delay_bounds))]
 
 

@@ -10,7 +10,7 @@ T = 0.1 * np.arange(300)
 
 
 def of(u, hold="zoh", t=T, **more):
-    return repetitions_of(HeldSignal(t, u, hold), float(t[-1]), **more)
+    return repetitions_of(HeldSignal(t, u, hold), t, **more)
 
 
 @pytest.mark.parametrize(("low", "level"), [(-1.0, 0.0), (0.0, 0.5)])
@@ -51,3 +51,9 @@ def test_a_stated_period_counts_unless_the_input_repeats_within_it():
     assert of(np.random.default_rng(3).standard_normal(300), period=30.0) == (Repetition(30.0, 1),)
     (found,) = of(np.where(np.arange(300) // 30 % 2, -1.0, 1.0), period=30.0)
     assert (found.shift, found.sign) == pytest.approx((3.0, -1))
+
+
+def test_an_input_given_by_its_changes_repeats_as_its_samples_do():
+    u = np.where(np.arange(300) // 20 % 2, -1.0, 1.0)
+    breaks = np.append(True, np.diff(u) != 0)
+    assert repetitions_of(HeldSignal(T[breaks], u[breaks]), T) == of(u)
