@@ -245,17 +245,25 @@ class _Choosing:
         delays = given or (0.0, latest)
         if given is not None and not several:
             return delays, latest
-        # Assuming rest may bias the delay; an estimated state does not.
-        settings = self._settings(latest)
-        settings = settings[-1:] if not (self.from_start and begins_quietly(self.part)) else settings[:1]
+        farthest = latest
+        if given is None and not self.repeats:
+            farthest = max(latest, _rounded(HALF * min(record.duration for record in self.part)))
         most = len(SMALL) if several else 2
-        models = SmallModels(self._common(settings, latest), self.span, delays, self.several, most=most)
-        ranking = models.compared(settings)
+        while True:
+            # Assuming rest may bias the delay; an estimated state does not.
+            settings = self._settings(latest)
+            settings = settings[:1] if self.from_start and begins_quietly(self.part) else settings[-1:]
+            models = SmallModels(self._common(settings, latest), self.span, delays, self.several, most=most)
+            ranking = models.compared(settings)
+            if latest >= farthest or max(delays_of(ranking.best.fit.model)) <= AT_END * latest:
+                break
+            latest = _rounded(min(2.0 * latest, farthest))
+            delays = 0.0, latest
         self._note(ranking)
         self.known = models.model if several else None
         if self.repeats and self._begins_later(ranking, latest):
             delays = 0.0, 2.0 * latest
-        return self._range_of(ranking, delays), latest
+        return self._range_of(ranking, delays), farthest
 
     def _begins_later(self, ranking: Ranking, latest: float) -> bool:
         """Return whether a response from rest begins after one interval of a repeating input, by the first samples."""
