@@ -255,15 +255,11 @@ class Peer:
 # --- systems -----------------------------------------------------------------------------------------
 
 
-def random_case(rng):
-    """Return a record, its true model, options without known coefficients, and with them."""
-    n = int(rng.integers(1, 5))
-    samples, h = int(rng.integers(300, 601)), 10.0 ** rng.uniform(-2, 0)
-    initial_state = str(rng.choice(["rest", "estimate"]))
-    offset = str(rng.choice(["none", "estimate"]))
+def random_system(rng, n, slowest, fastest):
+    """Return n poles between two speeds [rad/s], and the numerator, with fewer zeros, and denominator of a system."""
     poles = []
     while len(poles) < n:
-        w = np.exp(rng.uniform(np.log(12 / (samples * h)), np.log(0.6 / h)))
+        w = np.exp(rng.uniform(np.log(slowest), np.log(fastest)))
         if n - len(poles) >= 2 and rng.random() < 0.5:
             zeta = float(np.exp(rng.uniform(np.log(0.05), np.log(0.95))))
             poles += [w * complex(-zeta, sign * np.sqrt(1 - zeta**2)) for sign in (1, -1)]
@@ -275,6 +271,16 @@ def random_case(rng):
     b = np.atleast_1d(np.poly(-middle * np.exp(rng.uniform(-1.0, 1.0, m)) * rng.choice([1, -1], m)))
     a = np.real(np.poly(poles))
     b = b / b[-1] * a[-1] * rng.uniform(0.5, 3.0)
+    return poles, b, a
+
+
+def random_case(rng):
+    """Return a record, its true model, options without known coefficients, and with them."""
+    n = int(rng.integers(1, 5))
+    samples, h = int(rng.integers(300, 601)), 10.0 ** rng.uniform(-2, 0)
+    initial_state = str(rng.choice(["rest", "estimate"]))
+    offset = str(rng.choice(["none", "estimate"]))
+    poles, b, a = random_system(rng, n, 12 / (samples * h), 0.6 / h)
     kind = str(rng.choice(["none", "known", "searched"]))
     delay = 0.0 if kind == "none" else float(rng.uniform(0, 8 * h))
     bounds = (delay, delay) if kind != "searched" else (0.0, 12 * h)
@@ -290,6 +296,7 @@ def random_case(rng):
         x = x + rng.standard_normal() * np.std(x) * free / np.abs(free).max()
     x = x + (rng.uniform(-2, 2) * np.std(x) if offset == "estimate" else 0.0)
     y = x + rng.standard_normal(samples) * x.std() * 10 ** (-rng.uniform(5, 30) / 20)
+    m = b.size - 1
     names = [f"a{k}" for k in range(1, n + 1)] + [f"b{k}" for k in range(m + 1)]
     count = int(rng.integers(1, min(2, len(names) - 1) + 1))
     chosen = rng.choice(len(names), count, replace=False)

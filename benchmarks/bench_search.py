@@ -20,7 +20,7 @@ from pathlib import Path
 from _timing import cpu
 
 import numpy as np
-from bench_known import Peer, reached
+from bench_known import Peer, random_system, reached
 from bench_optimum import modal_responses
 
 from ctid_cli import DataError, DelayProfile, Fixed, HeldSignal, Prbs, Record, TransferFunction
@@ -35,20 +35,8 @@ def random_case(rng):
     """Return a record and its true model."""
     n, samples = int(rng.integers(1, 5)), int(rng.integers(200, 501))
     length = float(np.exp(rng.uniform(np.log(50.0), np.log(150.0))))
-    h, poles = length / samples, []
-    while len(poles) < n:
-        w = np.exp(rng.uniform(np.log(6.0 / length), np.log(0.8 / h)))
-        if n - len(poles) >= 2 and rng.random() < 0.5:
-            zeta = float(np.exp(rng.uniform(np.log(0.05), np.log(0.95))))
-            poles += [w * complex(-zeta, sign * np.sqrt(1 - zeta**2)) for sign in (1, -1)]
-        else:
-            poles.append(complex(-w))
-    poles = np.array(poles)
-    m = int(rng.integers(0, n))
-    middle = np.exp(np.mean(np.log(np.abs(poles))))
-    b = np.atleast_1d(np.poly(-middle * np.exp(rng.uniform(-1.0, 1.0, m)) * rng.choice([1, -1], m)))
-    a = np.real(np.poly(poles))
-    b = b / b[-1] * a[-1] * rng.uniform(0.5, 3.0)
+    h = length / samples
+    poles, b, a = random_system(rng, n, 6.0 / length, 0.8 / h)
     delay = float(rng.uniform(0.0, 15.0))
     t = h * np.arange(samples)
     if rng.random() < 0.4:

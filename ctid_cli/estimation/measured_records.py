@@ -7,7 +7,7 @@ C represent any initial state. C, the offset c and the drift d are separate for 
 are common.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -359,11 +359,15 @@ class MeasuredRecords:
         """Return the least sum of squared output errors at a given delay of an input, in the basin of a model."""
         delays = delays_of(model)
         delays[k] = delay
-        bounds = tuple(
-            (delay, delay) if i == k else pair for i, pair in enumerate(each_bounds(self.treatment.delay_bounds))
-        )
-        poles = self.free_poles(model)
+        poles, bounds = self.free_poles(model), self.with_delays({k: delay}).treatment.delay_bounds
         return local_minimum(self.problem, poles, delays, bounds, known=self.known).squared_error
+
+    def with_delays(self, known: Mapping[int, float]) -> "MeasuredRecords":
+        """Return a copy with known delays of some inputs, by their indices; the used samples stay."""
+        other, each = copy(self), enumerate(each_bounds(self.treatment.delay_bounds))
+        bounds = tuple((known[k],) * 2 if k in known else pair for k, pair in each)
+        other.treatment = self.treatment._replace(delay_bounds=bounds)
+        return other
 
     def errors_of(self, model: SystemModel) -> AppliedModel:
         """Return the errors of a given model on these records, each with its best initial state and offset."""

@@ -286,7 +286,7 @@ class _Limit:
         if not np.isfinite([interval.low, interval.high]).all():
             return
         for delay in np.linspace(interval.low, interval.high, DELAYS).tolist():
-            found = at_delay(near, self.fit, delay, k)
+            found = _at_delays(near, self.fit, {k: delay})
             other = None if found is None else self.of(near, found)
             if found is not None and other is not None:
                 rise = self.rise(found, profile.inflation)
@@ -299,9 +299,11 @@ class _Limit:
         if delays_of(self.fit.model) == delays_of(other.fit.model):
             return None
         start, stop = (np.array(delays_of(each.model)) for each in (self.fit, other.fit))
+        free = [k for k, (low, high) in enumerate(each_bounds(near.treatment.delay_bounds)) if low < high]
         found = list[Accepted]()
         for delays in np.linspace(start, stop, DELAYS)[1:-1].tolist():
-            optima = [at_delays(near, each, delays) for each in (self.fit, other.fit)]
+            held = {k: delays[k] for k in free}
+            optima = [_at_delays(near, each, held) for each in (self.fit, other.fit)]
             least = min(filter(None, optima), key=lambda one: one.squared_error, default=None)
             fit = None if least is None else self.of(near, least)
             if least is None or fit is None or self.rise(least, self.inflation) >= 1.0:
@@ -364,25 +366,12 @@ def _uncertain_delays(fit: MeasuredFit, law: Uncertainty, near: MeasuredRecords)
             yield k
 
 
-def at_delay(near: MeasuredRecords, fit: MeasuredFit, delay: float, k: int) -> Optimum | None:
-    """Return the least squared error at a given delay of an input, in the basin of a fit."""
-    delays = delays_of(fit.model)
-    delays[k] = delay
-    return at_delays(near, fit, delays, [k])
-
-
-def at_delays(
-    near: MeasuredRecords, fit: MeasuredFit, delays: Sequence[float], held: Sequence[int] | None = None
-) -> Optimum | None:
-    """Return the least squared error at given delays, by default of all inputs, in the basin of a fit."""
-    each = each_bounds(near.treatment.delay_bounds)
-    held = [k for k, (low, high) in enumerate(each) if low < high] if held is None else held
-    other = copy(near)
-    bounds = tuple((delays[k],) * 2 if k in held else pair for k, pair in enumerate(each))
-    other.treatment = near.treatment._replace(delay_bounds=bounds)
+def _at_delays(near: MeasuredRecords, fit: MeasuredFit, delays: Mapping[int, float]) -> Optimum | None:
+    """Return the least squared error at known delays of some inputs, by their indices, in the basin of a fit."""
+    each = [delays.get(k, own) for k, own in enumerate(delays_of(fit.model))]
     with suppress(CtidError, np.linalg.LinAlgError):
-        found = other.local((near.begin(fit.parametrised)[0], tuple(delays)))
-        return replace(found, delays_at_bound=tuple(sorted({*found.delays_at_bound, *held})))
+        found = near.with_delays(delays).local((near.begin(fit.parametrised)[0], tuple(each)))
+        return replace(found, delays_at_bound=tuple(sorted({*found.delays_at_bound, *delays})))
     return None
 
 

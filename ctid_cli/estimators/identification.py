@@ -24,7 +24,7 @@ from ctid_cli.estimators.frequency_domain import (
     FrequencyDomainSumFit,
 )
 from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopFit, LoopOutputError
-from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit, pieces_text
+from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit, several_intervals
 from ctid_cli.estimators.measured_submodels import LaidOutSubmodels, MeasuredSubmodels, SubmodelsFit
 from ctid_cli.estimators.reported_parameters import (
     determined,
@@ -163,8 +163,7 @@ class Identification(DeferredFields, FittedModel, Shown):
             One sentence for each; empty if there is nothing to say.
         """
         items = (*self.estimates, *self.derived)
-        shown = self.fit.equivalents if self.answer.seen else ()
-        found = replace(self.fit, undetermined={}, intervals={}, equivalents=shown).marks(time_unit)
+        found = self.fit._repeating(time_unit) if self.answer.seen else []
         reasons: dict[str, list[str]] = {}
         for item in items:
             if item.is_undetermined:
@@ -172,7 +171,7 @@ class Identification(DeferredFields, FittedModel, Shown):
                 name = f"{item.name} ({values})" if values else item.name
                 reasons.setdefault(item.reason.removeprefix(NOT_DETERMINED).lstrip(":. "), []).append(name)
             elif item.intervals:
-                found.append(f"{item.name}: {pieces_text(item.intervals)}, since other minima fit as well.")
+                found.append(several_intervals(item.name, item.intervals))
         found += [f"{NOT_DETERMINED}: {listed(names)}{f': {why}' if why else '.'}" for why, names in reasons.items()]
         return found
 

@@ -152,6 +152,14 @@ class MeasuredFit(DeferredFields, Fit):
         list of str
             One sentence for each; empty if there is nothing to say.
         """
+        found = self._repeating(time_unit)
+        if self.undetermined:
+            found.append(f"Not determined: {listed(self.undetermined)}.")
+        each = ((name, pieces) for name, pieces in self.intervals.items() if len(pieces) > 1)
+        return found + [several_intervals(name, pieces) for name, pieces in each]
+
+    def _repeating(self, time_unit: str) -> list[str]:
+        """Return the models that a repeating input cannot tell apart, in sentences."""
         found = []
         for one in self.equivalents:
             model = self.model.parts[one.input] if isinstance(self.model, MultiInputModel) else self.model
@@ -159,11 +167,6 @@ class MeasuredFit(DeferredFields, Fit):
             what = f"gain {gain:.5g}" if np.isfinite(gain) else "the opposite sign" if one.sign < 0 else "the same sign"
             of, name = (f" of {one.input}", f" {one.input}") if one.input else ("", "")
             found.append(f"Or {what} with delay{of} {one.delay:.5g} {time_unit}: the input{name} repeats.")
-        if self.undetermined:
-            found.append(f"Not determined: {listed(self.undetermined)}.")
-        for name, pieces in self.intervals.items():
-            if len(pieces) > 1:
-                found.append(f"{name}: {pieces_text(pieces)}, since other minima fit as well.")
         return found
 
     def uncertainty(
@@ -317,9 +320,9 @@ class MultiInputFit(MeasuredFit):
         raise UsageError(f"the model has the inputs {inputs}; take one of them, such as fit.of_input(NAME)")
 
 
-def pieces_text(pieces: Sequence[tuple[float, float]]) -> str:
-    """Return separate intervals as text."""
-    return " or ".join(f"{low:.5g} to {high:.5g}" for low, high in pieces)
+def several_intervals(name: str, pieces: Sequence[tuple[float, float]]) -> str:
+    """Return a sentence on a quantity with separate intervals."""
+    return f"{name}: {' or '.join(f'{low:.5g} to {high:.5g}' for low, high in pieces)}, since other minima fit as well."
 
 
 def delay_names(fit: MeasuredFit) -> list[str]:

@@ -318,19 +318,17 @@ class SmallModels:
             raise DataError(f"{named(self.records[0])}too few usable samples for a model's parameters")
         return ranked(found)
 
-    def larger(self, options: DelayProfile) -> Candidate | None:
-        """Fit a pole and a zero more, without known parameters, with an offset instead of the drift of some options."""
-        drifting = (key for key, one in self._structures.items() if one.options.offset == "drift")
-        found = next((key for key in drifting if _alike(self._structures[key].options, options)), None)
-        if found is None:
-            return None
-        setting, integrators = found
+    def larger(self, candidate: Candidate) -> Candidate | None:
+        """Fit a pole and a zero more than a candidate, without known parameters, and an offset instead of its drift."""
+        options = candidate.options
+        assert isinstance(options, DelayProfile)
         poles, zeros = options.poles + 1, options.zeros + 1
-        span = Span((poles, poles), (zeros, zeros), (integrators,))
-        own = Structures.of(
-            self.records, setting._replace(offset="estimate"), integrators, self.delays, self._begun(), span
-        )
-        return own.fit(poles, zeros) if poles + integrators <= MOST_POLES else None
+        if options.order == MOST_POLES:
+            return None
+        setting = Setting(candidate.hold, options.initial_state, options.input_before, "estimate")
+        span = Span((poles, poles), (zeros, zeros), (options.integrators,))
+        own = Structures.of(self.records, setting, options.integrators, self.delays, self._begun(), span)
+        return own.fit(poles, zeros)
 
     def _fitted(self, setting: Setting) -> Iterator[Candidate]:
         for integrators in self.span.integrators:
@@ -365,12 +363,6 @@ class SmallModels:
         """Return a model of a structure in the first setting with this number of integrators."""
         each = (one for (_, number), one in self._structures.items() if number == integrators)
         return next(each).model(poles, zeros)
-
-
-def _alike(one: DelayProfile, other: DelayProfile) -> bool:
-    """Return whether two options treat the records alike."""
-    names = ("initial_state", "input_before", "offset", "integrators")
-    return all(getattr(one, name) == getattr(other, name) for name in names)
 
 
 def zero_on_integrator(model: TransferFunction, length: float) -> float | None:

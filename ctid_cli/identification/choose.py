@@ -133,6 +133,7 @@ class _Choosing:
         self.first_reasons = [sentences.NO_INTEGRATOR] if drifts else []
         # A periodic state is that of the whole record.
         self.part, self.from_start = (records, True) if given.initial_state == "periodic" else parts_of(records)
+        self.quiet = self.from_start and begins_quietly(self.part)
         self.several = Several(self._ranges_of_inputs(), not isinstance(given.zeros, int))
         self.first_hold: Holds = "zoh" if given.hold == "auto" else given.hold
         self.reasons: list[str] = []
@@ -189,10 +190,7 @@ class _Choosing:
             return setting, ranking
         drifting = setting._replace(offset="drift")
         span = self.span._replace(integrators=(0,))
-        if not self.from_start:
-            drifting = drifting._replace(initial_state="estimate", input_before=None)
-        held = self._held(drifting)
-        others = without_overfitted(grid(held, drifting, span, delays, self.several), held)
+        others = without_overfitted(self._grid(drifting, delays, span), self._held(drifting))
         both = ranked([ranking.best, others.best])
         if both.best.fit is not others.best.fit:
             return setting, ranking
@@ -227,10 +225,10 @@ class _Choosing:
         held = tuple(with_hold(record, setting.hold) for record in self.records)
         return Choice(options, held, fitted, ranking, answer, tuple(reasons), self.gains, self.holds)
 
-    def _grid(self, setting: Setting, delays: tuple[float, float]) -> Ranking:
+    def _grid(self, setting: Setting, delays: tuple[float, float], span: Span | None = None) -> Ranking:
         if not self.from_start:
             setting = setting._replace(initial_state="estimate", input_before=None)
-        return grid(self._held(setting), setting, self.span, delays, self.several)
+        return grid(self._held(setting), setting, span or self.span, delays, self.several)
 
     def _held(self, setting: Setting) -> list[Record]:
         return [with_hold(record, setting.hold) for record in self.part]
@@ -252,7 +250,7 @@ class _Choosing:
         while True:
             # Assuming rest may bias the delay; an estimated state does not.
             settings = self._settings(latest)
-            settings = settings[:1] if self.from_start and begins_quietly(self.part) else settings[-1:]
+            settings = settings[:1] if self.quiet else settings[-1:]
             models = SmallModels(self._common(settings, latest), self.span, delays, self.several, most=most)
             ranking = models.compared(settings)
             if latest >= farthest or max(delays_of(ranking.best.fit.model)) <= AT_END * latest:
@@ -277,18 +275,14 @@ class _Choosing:
         if max(delays_of(best.fit.model)) <= latest:
             return False
         within = SmallModels(part, self.span, (0.0, latest), self.several, most=2).compared(rests)
-        own = ranked([*ranking.candidates, *within.candidates, best]).candidates
-        fits = [each for each in own if each.fit is not best.fit]
-        return own[0].fit is best.fit and own[0].criterion < fits[0].criterion - EVIDENT
+        first, second, *_ = ranked([*ranking.candidates, *within.candidates, best]).candidates
+        return first.fit is best.fit and first.criterion < second.criterion - EVIDENT
 
     def _latest(self) -> float:
         """Return the greatest delay that is tried [s]: one whole interval that a repeating input can tell apart."""
-        latest = greatest_delay(self.part)
-        if not self.part[0].several:
-            interval = distinguishable_delays(self.part, self.given)
-            self.repeats = bool(np.isfinite(interval))
-            latest = interval if self.repeats else latest
-        return _rounded(latest)
+        interval = np.inf if self.part[0].several else distinguishable_delays(self.part, self.given)
+        self.repeats = bool(np.isfinite(interval))
+        return _rounded(interval if self.repeats else greatest_delay(self.part))
 
     def _note(self, models: Ranking) -> None:
         """Keep the delays of the best small model, from which later searches of several inputs start."""
@@ -338,7 +332,7 @@ class _Choosing:
         options = kept.best.options
         if options.offset != "drift" or not isinstance(options, DelayProfile):
             return kept
-        larger = models.larger(options)
+        larger = models.larger(kept.best)
         others = [each for each in ranking.candidates if each.options.offset != "drift"]
         if larger is None or ranked([*kept.candidates, larger]).best.fit is not larger.fit:
             return kept
@@ -367,7 +361,7 @@ class _Choosing:
     def _settings(self, latest: float) -> list[Setting]:
         """Return settings with the states that can be compared, with an offset."""
         states: list[State] = states_of(self.part, self.given) if self.from_start else [("estimate", None)]
-        if self.from_start and begins_quietly(self.part) and ("rest", "first") in states:
+        if self.quiet and ("rest", "first") in states:
             states = [("rest", "first")]
         if len(states) > 1 and not excited_after(self.part, latest):
             states = [state for state in states if state[0] != "estimate"]
