@@ -15,7 +15,7 @@ from ctid_cli.estimation.iteration import Problem
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.filtering.filter_data import FilterData
-from ctid_cli.inference.covariance import condition_number, white_noise_covariance
+from ctid_cli.inference.covariance import condition_number, white_noise_dispersion
 from ctid_cli.inference.criteria import percent_from_r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord, Status
 from ctid_cli.inference.noise_estimate import orders_of
@@ -364,9 +364,9 @@ def assessed(
         law = estimate_uncertainty([psi], [error], kind, draws, tangent=tangent)
     elif tangent.shape[1] and kind == "white":
         hessian = tangent.T @ equations.hessian @ tangent
-        covariance = white_noise_covariance(hessian, equations.squared_error, problem.samples)
-        law = Uncertainty("white", tangent, covariance, problem.samples)
-    if status is Status.CONVERGED and law is not None and not np.isfinite(law.free_covariance).all():
+        found = white_noise_dispersion(hessian, equations.squared_error, problem.samples)
+        law = Uncertainty.of("white", tangent, found)
+    if status is Status.CONVERGED and law is not None and not law.defined:
         status = Status.SINGULAR
     covariance = nothing if law is None else law.covariance
     spread = float(np.sum((y - y.mean()) ** 2))

@@ -42,10 +42,12 @@ from ctid_cli.estimation.record_preparation import (
     without_outliers,
 )
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
+from ctid_cli.inference.covariance import Rounding
 from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.repetition import Equivalent, Repetition, repetitions_of, without_level
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.sensitivities import Structure, SumStructure
+from ctid_cli.inference.signal_features import quantum
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.several_inputs import AnyModel, SystemModel, delays_of, fractions_of
 from ctid_cli.signals.noise import ArmaNoise
@@ -278,6 +280,16 @@ class MeasuredRecords:
         return tuple(used_samples(*pair) for pair in zip(self.data, self.records, strict=True))
 
     # --- minimum of the output error -----------------------------------------------------------------
+
+    @cached_property
+    def _steps(self) -> list[float]:
+        """Step of the output of each record, if it is coarsely rounded, else NaN."""
+        return [quantum(record.y[record.valid]) for record in self.records]
+
+    def rounding(self, errors: Sequence[Array]) -> tuple[Rounding | None, ...]:
+        """Return the rounding of each output whose step exceeds the deviation of the output errors; none of lines."""
+        each = zip(self._steps, self.problem.records, errors, strict=False)
+        return tuple(Rounding(step, data.y_used - e) if step > e.std() else None for step, data, e in each)
 
     def with_outputs(self, outputs: Sequence[Array]) -> "MeasuredRecords":
         """Return a copy with other outputs at the used samples of each record."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import islice, permutations
 from typing import ClassVar
 
@@ -27,8 +27,8 @@ from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.submodels import InitialState
 from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.fit import Fit
-from ctid_cli.inference.intervals import UncertainValue, normal_quantile
-from ctid_cli.inference.uncertainty import DRAWS, Covariance
+from ctid_cli.inference.intervals import UncertainValue
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty
 from ctid_cli.models.additive import AdditiveModel, Term, names_of
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.record import Record
@@ -86,8 +86,7 @@ class AdditiveFit(Fit):
             With standard errors by the delta method, see
             :func:`~ctid_cli.inference.derived.derived_parameters`.
         """
-        quantile = (lambda _: normal_quantile(level)) if self.law is None else partial(self.law.quantile, level=level)
-        return derived_parameters(self.additive, self.covariance, quantile)
+        return derived_parameters(self.additive, self.law or Uncertainty.known(self.covariance), level=level)
 
 
 @dataclass(frozen=True)

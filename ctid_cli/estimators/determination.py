@@ -53,7 +53,7 @@ NARROW = 0.25
 #: Fields of a fit that differ between minima.
 OF_A_MINIMUM = (
     *("model", "status", "cost", "fit_percent", "r2", "condition_number", "iterations", "theta", "initial_states"),
-    *("offsets", "residuals", "sensitivities", "box", "held_poles", "tangent"),
+    *("offsets", "residuals", "sensitivities", "rounding", "box", "held_poles", "tangent"),
 )
 OTHER_MINIMA = f"{NOT_DETERMINED}: other minima fit as well."
 AT_OUR_BOUND = f"{NOT_DETERMINED}: a pole is at the bound of the admissible models, which it reflects."
@@ -185,7 +185,7 @@ def determination_of(
     ``inside``: minima ever farther inside each given bound that a parameter is at.
     """
     alone = Determination(((Accepted(fit, law, 0.0),),))
-    if not isinstance(measured, MeasuredRecords) or not np.isfinite(law.free_covariance).all():
+    if not isinstance(measured, MeasuredRecords) or not law.defined:
         return alone
     near = measured.near(fit.residuals, fit.weighting, fit.arma)
     limit = _Limit(fit, law)

@@ -19,7 +19,7 @@ from ctid_cli.estimators.additive_output_error import GROWN, AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.measured_fit import MeasuredFit, fitted, samples_at
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
-from ctid_cli.inference.covariance import robust_covariance, sandwich, unit_inverse
+from ctid_cli.inference.covariance import Dispersion, robust_dispersion, sandwich, undefined, unit_inverse
 from ctid_cli.inference.residual_tests import all_white, chi_square_tail, normal_tail
 from ctid_cli.inference.sensitivities import Structure, SumStructure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty
@@ -77,18 +77,20 @@ class FrequencyDomainFit(MeasuredFit):
         psi, e = self.sensitivities[0] @ self.tangent, self.residuals[0]
         if kind == "robust" or (kind == "auto" and self.correlated):
             lines = self.data.frequencies.size
-            found, noise = robust_covariance(np.split(psi, [lines]), np.split(e, [lines]))
-            return Uncertainty("robust", self.tangent, found, noise.effective_count(e.size))
-        inverse = unit_inverse(psi.T @ psi) if e.size > psi.shape[1] else None
+            found = robust_dispersion(np.split(psi, [lines]), np.split(e, [lines]))
+            return Uncertainty.of("robust", self.tangent, found)
+        spare = e.size - psi.shape[1]
+        inverse = unit_inverse(psi.T @ psi) if spare > 0 else None
         if inverse is None:
-            return Uncertainty("white", self.tangent, np.full((psi.shape[1],) * 2, np.nan), e.size)
+            return Uncertainty.of("white", self.tangent, undefined(psi.shape[1]))
         if self.errors_known:
-            return Uncertainty("white", self.tangent, inverse[0] * np.outer(inverse[1], inverse[1]), np.inf)
+            known = Dispersion.scaled(inverse[0] * np.outer(inverse[1], inverse[1]), np.inf)
+            return Uncertainty.of("white", self.tangent, known)
         # Squared residuals over their expectation allow any variance over frequency (HC2, MacKinnon and White, 1985).
         scaled = psi * inverse[1]
         leverage = np.einsum("ki,ij,kj->k", scaled, inverse[0], scaled)
         weighed = scaled * (e / np.sqrt(np.maximum(1.0 - leverage, 1e-12)))[:, None]
-        return Uncertainty("white", self.tangent, sandwich(*inverse, weighed.T @ weighed), e.size)
+        return Uncertainty.of("white", self.tangent, Dispersion.scaled(sandwich(*inverse, weighed.T @ weighed), spare))
 
     @property
     def correlated(self) -> bool:

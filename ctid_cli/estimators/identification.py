@@ -231,14 +231,18 @@ class Identification(DeferredFields, FittedModel, Shown):
             return BIASED
         if not np.isfinite(np.diag(found.covariance)).any():
             return "There are no standard errors."
+        passed = all(test.white for test in self.tests)
         if found.kind == "white":
-            text = f"Standard errors are those for white {what}" + f", as the {what} pass the test" * bool(self.tests)
+            text = f"Standard errors are those for white {what}"
+            text += f", as the {what} pass the test" * bool(self.tests and passed)
         else:
-            why = "" if all(test.white for test in self.tests) else f", because the {what} are not white"
-            text = f"Standard errors are those for coloured noise{why}"
+            noise = "coloured noise" + " of changing variance" * found.changing
+            why = "" if passed else f", because the {what} are not white"
+            text = f"Standard errors are those for {noise}{why}{', and for the rounded output' * found.rounded}"
         if found.bootstrap is None:
-            text += f"; intervals are estimate -+ {found.quantile(np.zeros(1)):.3g} of them"
-            text += f" (t, {found.degrees_of_freedom:.4g} degrees of freedom)"
+            reach, freedom = found.quantiles(), found.freedom(found.tangent[found.tangent.any(axis=1)])
+            text += f"; intervals are estimate -+ {_span(reach[np.isfinite(reach)], 3)} of them"
+            text += f" (t, {_span(freedom, 4)} degrees of freedom)"
         else:
             draws = f"95 % of {len(found.bootstrap.errors)} estimates from simulated noise"
             text += f"; intervals are estimate -+ as many of them as {draws} keep within (bootstrap-t)"
@@ -415,6 +419,12 @@ def answer_of(options: Options, records: Sequence[Record], used: Sequence[BoolAr
     ]
     best = min(tests, key=lambda test: test.p_value)
     return replace(best, p_value=min(1.0, len(names) * best.p_value))
+
+
+def _span(values: Array, digits: int) -> str:
+    """Return the least and the largest of several values, in words."""
+    low, high = (f"{value:.{digits}g}" for value in (values.min(), values.max()))
+    return low if low == high else f"{low} to {high}"
 
 
 def unsafe_intervals(found: Identification) -> list[str]:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -15,10 +16,12 @@ from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.noise_search import joint_optimum
 from ctid_cli.estimation.optimum.best_model import Begin, Optimum
 from ctid_cli.estimation.optimum.box import Box
+from ctid_cli.estimation.optimum.known import null_space
 from ctid_cli.estimation.output_sensitivities import sensitivities
-from ctid_cli.estimation.parameter_layout import Layout
+from ctid_cli.estimation.parameter_layout import Degrees, Layout
 from ctid_cli.estimation.robust_fit import RobustFit
 from ctid_cli.filtering.bank import Equations
+from ctid_cli.inference.covariance import Rounding, condition_number
 from ctid_cli.inference.criteria import percent_from_r_squared
 from ctid_cli.inference.fit import DeferredFields, Fit, InputFit, Status
 from ctid_cli.inference.innovations import NoiseFit
@@ -27,6 +30,7 @@ from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_cova
 from ctid_cli.inference.repetition import Equivalent
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
 from ctid_cli.inference.uncertainty import DRAW, DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
+from ctid_cli.models.factoring import section_basis
 from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of
 from ctid_cli.progress import calling
 from ctid_cli.signals.noise import ArmaNoise
@@ -103,9 +107,11 @@ class MeasuredFit(DeferredFields, Fit):
         95 % intervals of parameters that do not follow from the covariance.
     other_minima : tuple of Begin
         Starts of further minima of the search that are nearly as low.
+    rounding : tuple of Rounding or None
+        Step and fitted output of each record whose output is coarsely rounded, else None.
     """
 
-    deferred: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
+    deferred: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used", "rounding")
     #: Fields in files of earlier versions.
     former: ClassVar[tuple[str, ...]] = ("profile",)
 
@@ -129,6 +135,7 @@ class MeasuredFit(DeferredFields, Fit):
     undetermined: Mapping[str, str] = field(default_factory=dict)
     intervals: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
     other_minima: tuple[Begin, ...] = ()
+    rounding: tuple[Rounding | None, ...] = field(default_factory=tuple)
 
     @property
     def standard_errors(self) -> dict[str, float]:
@@ -190,7 +197,14 @@ class MeasuredFit(DeferredFields, Fit):
         """
         linear = self.linear
         with calling(progress, DRAW):
-            found = estimate_uncertainty(linear.sensitivities, linear.residuals, kind, draws, tangent=self.tangent)
+            found = estimate_uncertainty(
+                linear.sensitivities,
+                linear.residuals,
+                kind,
+                draws,
+                tangent=self.tangent,
+                rounding=() if self.noise or self.weighting else self.rounding,
+            )
         return found.in_ignored_loop if self.in_ignored_loop and kind == "auto" else found
 
     def _with_uncertainty(self, kind: Covariance, draws: int) -> Self:
@@ -199,7 +213,7 @@ class MeasuredFit(DeferredFields, Fit):
 
     def _with_law(self, law: Uncertainty) -> Self:
         """Return the fit with its uncertainty; singular if it converged but has no covariance."""
-        undefined = law.kind != "biased" and not np.isfinite(law.free_covariance).all()
+        undefined = law.kind != "biased" and not law.defined
         singular = self.status is Status.CONVERGED and undefined
         return replace(self, covariance=law.covariance, law=law, status=Status.SINGULAR if singular else self.status)
 
@@ -340,6 +354,7 @@ class FittedSamples(NamedTuple):
     sensitivities: tuple[Array, ...]
     used: tuple[BoolArray, ...]
     weighting: Weighting | None
+    rounding: tuple[Rounding | None, ...] = ()
 
     @property
     def linear(self) -> "FittedSamples":
@@ -365,6 +380,8 @@ def fitted(
     model = measured.model(found)
     samples = samples_at(measured, model, theta, None if robust is None else robust.losses)
     residuals, law = samples.residuals, samples.linear
+    given = _given(layout, measured)
+    tangent = _tangent(layout, found, given)
     hessian = np.sum([psi.T @ psi for psi in law.sensitivities], axis=0)
     each = zip(law.sensitivities, law.residuals, strict=True)
     gradient = np.sum([psi.T @ eps for psi, eps in each], axis=0)
@@ -373,8 +390,8 @@ def fitted(
     values = quality(equations, measured.spread, count)
     if robust is not None:
         values["cost"] = robust.cost(robust.losses) / count
+    values["condition_number"] = condition_number(tangent.T @ hessian @ tangent)
     states, offsets = measured.own(layout, theta)
-    given = _given(layout, measured)
     kind: Any = MultiInputFit if isinstance(model, MultiInputModel) else MeasuredFit
     fit: MeasuredFit = kind(
         model=model,
@@ -389,12 +406,13 @@ def fitted(
         residuals=residuals,
         sensitivities=samples.sensitivities,
         used=samples.used,
+        rounding=samples.rounding,
         starts=Starts(found.tried, found.agree),
         poles_at_infinity=found.poles_at_infinity,
         box=found.box,
         weighting=samples.weighting,
         held_poles=tuple(found.held_poles.tolist()),
-        tangent=_tangent(layout, found, given),
+        tangent=tangent,
         known=tuple(np.array(layout.names)[given].tolist()),
         other_minima=tuple(each.start for each in found.others),
         **values,
@@ -449,7 +467,7 @@ def samples_at(
     psi, errors = zip(*sensitivities(measured.problem, layout, theta, delays_of(model)), strict=True)
     used = measured.used()
     if losses is None:
-        return FittedSamples(errors, psi, used, None)
+        return FittedSamples(errors, psi, used, None, measured.rounding(errors))
     # Sensitivities are computed with interpolated outliers; the errors here are from measured outputs.
     each = zip(measured.outputs, measured.problem.records, errors, strict=True)
     errors = tuple(y - (data.y_used - eps) for y, data, eps in each)
@@ -466,13 +484,30 @@ def _given(layout: Layout, measured: MeasuredRecords) -> BoolArray:
 
 
 def _tangent(layout: Layout, found: Optimum, fixed: BoolArray) -> Array:
-    """Return the directions that preserve known parameters and keep poles and delays in the admissible set."""
+    """Return the directions that preserve known parameters and keep poles and delays in the admissible set.
+
+    Columns are changes by the logarithms of speeds and dampings of the poles, and of the outputs of a cascade of
+    sections of the poles, for numerators and initial states: directions along coefficients may be nearly parallel.
+    """
     degrees, fixed = layout.degrees, fixed.copy()
     for k in found.delays_at_bound:
         fixed[degrees.delay(k)] = True
-    if not found.held_poles.size:
-        return np.eye(layout.size)[:, ~fixed]
+    fixed[degrees.denominators] = True
     moving = np.zeros((layout.size, found.pole_slopes.shape[1]))
     moving[degrees.denominators] = found.pole_slopes
-    fixed[degrees.denominators] = True
-    return np.column_stack((moving, np.eye(layout.size)[:, ~fixed]))
+    columns = [moving]
+    if isinstance(degrees, Degrees):
+        each = found.denominators
+        blocks = [(own, each[0 if degrees.common else k]) for k, own in enumerate(degrees.b)]
+        if layout.initial_state:
+            ends = np.cumsum([0, *degrees.orders])
+            for first in map(layout.first, range(layout.experiments)):
+                states = (slice(first + low, first + high) for low, high in pairwise(ends.tolist()))
+                blocks += zip(states, each, strict=True)
+        for own, denominator in blocks:
+            known, basis = np.flatnonzero(fixed[own]), section_basis(denominator, own.stop - own.start)
+            directions = np.zeros((layout.size, own.stop - own.start - known.size))
+            directions[own] = basis @ null_space(basis[known]) if known.size else basis
+            columns.append(directions)
+            fixed[own] = True
+    return np.column_stack((*columns, np.eye(layout.size)[:, ~fixed]))

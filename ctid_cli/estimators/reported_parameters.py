@@ -13,11 +13,12 @@ from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimators.determination import LEVEL, Accepted, Determination, cost_of_delay, determination_of
 from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit, delay_names
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
-from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
+from ctid_cli.inference.covariance import LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.intervals import BIASED, DelayInterval, UncertainValue
+from ctid_cli.inference.sensitivities import parts_of
 from ctid_cli.inference.uncertainty import Uncertainty
-from ctid_cli.models.several_inputs import delays_of
+from ctid_cli.models.several_inputs import MultiInputModel, delays_of
 
 
 class ReportedParameters(NamedTuple):
@@ -56,7 +57,7 @@ def reported_parameters(
     singular = not condition_number(hessian) <= NEARLY_SINGULAR
     unclear = {
         fit.parameter_names[k]
-        for k in (free if singular else _undetermined(fit, uncertainty_of_data(fit, uncertainty).covariance))
+        for k in (free if singular else _undetermined(fit, uncertainty_of_data(fit, uncertainty)))
     }
     if not seen:
         unclear |= {name for name in fit.parameter_names if not name.startswith("offset")}
@@ -82,27 +83,45 @@ def uncertainty_of_data(fit: MeasuredFit, uncertainty: Uncertainty) -> Uncertain
     return fit.uncertainty("white") if uncertainty.kind == "biased" else uncertainty
 
 
-def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
-    """Return the parameters that the data do not determine, for which no standard error is reported.
-
-    These are coefficients with a standard error above ten times their size, and parameters correlated with them.
-    """
-    names, errors = fit.parameter_names, np.sqrt(np.diag(covariance))
+def _undetermined(fit: MeasuredFit, law: Uncertainty) -> set[int]:
+    """Return the coefficients with a standard error above ten times their size, for which none is reported."""
+    names, errors = fit.parameter_names, law.errors(np.eye(fit.theta.size))
     looked_at = np.array([re.fullmatch(r"(.*_)?[ab]\d+", name) is not None for name in names])
     if not fit.signs_known:
         looked_at &= np.array(["a" not in name for name in names])
     unclear = ~np.isfinite(errors) | (looked_at & (errors > LARGE_STANDARD_ERROR * np.abs(fit.theta)))
     unclear[~fit.tangent.any(axis=1)] = False
-    with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = np.abs(covariance / np.outer(errors, errors))
-    moving = (correlation[unclear] > CLOSE_TO_ONE).any(axis=0)
-    return set(np.flatnonzero(unclear | moving).tolist())
+    return set(np.flatnonzero(unclear).tolist())
 
 
 def free_directions(fit: MeasuredFit) -> tuple[IndexArray, Array]:
     """Return the indices of the parameters that are not at a bound, and ``sum psi psi'`` along the free directions."""
     hessian = sum((psi.T @ psi for psi in fit.sensitivities), np.zeros((fit.theta.size, fit.theta.size)))
     return np.flatnonzero(fit.tangent.any(axis=1)), fit.tangent.T @ hessian @ fit.tangent
+
+
+def direction_names(fit: MeasuredFit) -> list[str]:
+    """Return names of the free directions: numbers of poles as in the list of derived quantities, and parameters."""
+    found = []
+    for column in fit.tangent.T:
+        place = int(np.argmax(np.abs(column)))
+        name = fit.parameter_names[place]
+        own = re.fullmatch(r"((?:.+_)?)a\d+", name)
+        if own is None:
+            found.append(fit.parameter_names[int(np.flatnonzero(column)[0])])
+        elif np.count_nonzero(column) == 1 and isinstance(fit, SubmodelsFit):
+            found.append(name)
+        else:
+            prefix, parts = own[1], fit.model.parts if isinstance(fit.model, MultiInputModel) else {"": fit.model}
+            model = parts.get(prefix[:-1]) or next(iter(parts.values()))
+            poles = parts_of(model)[0].pole_slopes()[0]
+            change = column[[fit.parameter_names.index(f"{prefix}a{k}") for k in range(1, model.order + 1)]]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                moved = np.abs(np.polyval(change, poles) / np.polyval(np.polyder(model.denominator), poles) / poles)
+            upper = [k for k, pole in enumerate(poles) if pole.imag >= 0]
+            nearest = max(range(len(upper)), key=lambda k: np.nan_to_num(moved[upper[k]]))
+            found.append(f"{prefix}pole {nearest + 1}")
+    return found
 
 
 def _delay_interval(
@@ -118,16 +137,15 @@ def _estimates(
 ) -> tuple[UncertainValue, ...]:
     """Return the parameters: numerator, denominator, delay, then those of the experiments."""
     found: dict[str, UncertainValue] = {}
-    with np.errstate(invalid="ignore"):
-        errors = np.sqrt(np.diag(uncertainty.covariance))
+    errors, reach = uncertainty.errors(np.eye(fit.theta.size)), uncertainty.quantiles(LEVEL)
     free = set(free_directions(fit)[0].tolist())
     for k, (name, value) in enumerate(zip(fit.parameter_names, fit.theta.tolist(), strict=True)):
         if name in unclear:
             found[name] = UncertainValue(name, value, status="undetermined")
         elif k in free:
-            reach = uncertainty.quantile(np.eye(errors.size)[k], LEVEL)
             reason = BIASED if uncertainty.kind == "biased" else ""
-            found[name] = UncertainValue.symmetric(name, value, float(errors[k]), quantile=reach, reason=reason)
+            own = float(errors[k]), float(reach[k])
+            found[name] = UncertainValue.symmetric(name, value, own[0], quantile=own[1], reason=reason)
         else:
             found[name] = UncertainValue(name, value, status="fixed" if name in fit.known else "at bound")
         if name in intervals:
@@ -148,33 +166,23 @@ def _estimates(
 
 def _derived(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool) -> tuple[UncertainValue, ...]:
     """Return poles, time constants, frequencies, damping and gain; without errors if no response is detected."""
-    covariance = uncertainty.covariance if seen else np.full_like(uncertainty.covariance, np.nan)
-    # Known parameters have no variance.
-    known = np.isin(fit.parameter_names, fit.known)
-    covariance[known] = covariance[:, known] = 0.0
+    law = uncertainty if seen else uncertainty.undefined
+    held = bool(fit.held_poles or fit.bounds_met)
     if isinstance(fit, SubmodelsFit) and fit.additive is not None:
-        return derived_parameters(fit.additive, covariance, uncertainty.quantile)
+        return derived_parameters(fit.additive, law)
     if isinstance(fit, MultiInputFit):
-        return _derived_of_inputs(fit, covariance, uncertainty)
+        return _derived_of_inputs(fit, law, held)
     size = fit.model.denominator.size + sum(name.startswith("b") for name in fit.parameter_names) - 1
-    held = fit.tangent[:size] if fit.held_poles or fit.bounds_met else None
-    return derived_parameters(fit.model, covariance[:size, :size], uncertainty.quantile, held)
+    return derived_parameters(fit.model, law.transformed(np.eye(size, len(law.tangent))), held=held)
 
 
-def _derived_of_inputs(fit: MultiInputFit, covariance: Array, uncertainty: Uncertainty) -> tuple[UncertainValue, ...]:
+def _derived_of_inputs(fit: MultiInputFit, law: Uncertainty, held: bool) -> tuple[UncertainValue, ...]:
     """Return derived quantities of the transfer function of each input; those of a common denominator once."""
     found: list[UncertainValue] = []
     for k, (name, model) in enumerate(fit.model.parts.items()):
         names = fit.of_input(name).parameter_names
         own = [i for kind in "ab" for i, each in enumerate(names) if each.startswith(kind)]
-
-        def quantile(gradient: Array, own: Sequence[int] = own) -> float:
-            whole = np.zeros(len(covariance))
-            whole[own[: gradient.size]] = gradient
-            return uncertainty.quantile(whole)
-
-        held = fit.tangent[own] if fit.held_poles or fit.bounds_met else None
-        values = derived_parameters(model, covariance[np.ix_(own, own)], quantile, held)
+        values = derived_parameters(model, law.transformed(np.eye(len(names))[own]), held=held)
         shared = [] if not fit.model.common else [item for item in values if item.name != "static_gain"]
         found += shared if k == 0 else []
         found += [replace(item, name=f"{name}_{item.name}") for item in values if item not in shared]

@@ -1,5 +1,6 @@
 """Warnings of a fit: at most five sentences, the most important first."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -9,12 +10,12 @@ from ctid_cli.arrays import BoolArray
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Identification, unsafe_intervals
 from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit, delay_names
-from ctid_cli.estimators.reported_parameters import free_directions
+from ctid_cli.estimators.reported_parameters import direction_names, free_directions
 from ctid_cli.identification.candidates import zero_on_integrator
 from ctid_cli.identification.changes import Kind
 from ctid_cli.identification.remedies import Remedy, Trials, tried_remedies
 from ctid_cli.identification.sentences import outlying, spelled
-from ctid_cli.inference.covariance import condition_number, describe_conditioning
+from ctid_cli.inference.covariance import LARGE_STANDARD_ERROR, describe_conditioning
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, input_dependence
 from ctid_cli.inference.signal_features import growth_time, residual_outliers, saturated
@@ -274,17 +275,16 @@ def of_lost_poles(fit: MeasuredFit) -> Iterator[str]:
 
 def of_conditioning(fit: MeasuredFit, known: Uncertainty) -> Iterator[str]:
     """Yield what the data do not determine."""
-    _, hessian = free_directions(fit.linear)
-    names: list[str] = []
-    values: list[float] = []
-    for column in fit.tangent.T:
-        place = int(np.argmax(np.abs(column)))
-        own = np.count_nonzero(column) == 1
-        names.append(fit.parameter_names[place] if own else f"pole {len(names) + 1}")
-        any_value = names[-1].startswith("a") and not fit.signs_known
-        values.append(np.inf if any_value else fit.theta[place])
-    found = describe_conditioning(known.free_covariance, np.array(values), names, condition_number(hessian), hessian)
-    yield from (each.removesuffix(".") for each in found)
+    hessian = free_directions(fit.linear)[1]
+    yield from (
+        each.removesuffix(".") for each in describe_conditioning(known.free_covariance, direction_names(fit), hessian)
+    )
+    for name, value, error in zip(fit.parameter_names, fit.theta, known.errors(np.eye(fit.theta.size)), strict=True):
+        looked_at = re.fullmatch(r"[ab]\d+|delay", name) and (fit.signs_known or not name.startswith("a"))
+        if looked_at and error > LARGE_STANDARD_ERROR * abs(value):
+            times = f"{error / abs(value):.2g} times its value" if value else "its value being zero"
+            start = f"{name} = {value:.3g} has a standard error of {error:.3g}, {times}"
+            yield f"{start}: these data do not even determine its sign"
 
 
 def _of_uncertainty(found: Identification, time_unit: str) -> Iterator[str]:
@@ -295,9 +295,8 @@ def _of_uncertainty(found: Identification, time_unit: str) -> Iterator[str]:
     fit, uncertainty = found.fit, found.uncertainty
     yield from of_conditioning(fit, fit.uncertainty("white") if uncertainty.kind == "biased" else uncertainty)
     if uncertainty.short:
-        worth = f"its {fit.count} samples are worth {uncertainty.effective_count:.2g} independent ones"
-        size = len(uncertainty.free_covariance)
-        yield f"The record is short for its noise: {worth}, the model has {size} parameters, and intervals are rough"
+        freedom = f"{uncertainty.degrees_of_freedom:.2g} degrees of freedom"
+        yield f"The record is short for its noise: some intervals are those of Student's t with {freedom}, and rough"
     if unsafe := unsafe_intervals(found):
         what = f"Intervals of {listed(unsafe)} are" if len(unsafe) > 1 else f"The interval of {unsafe[0]} is"
         yield f"{what} unsafe: so far from the estimate the output is not linear in the parameters"

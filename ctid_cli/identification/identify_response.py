@@ -15,7 +15,7 @@ from ctid_cli.inference.fit import Status
 from ctid_cli.inference.response_test import LEVEL, ResponseTest
 from ctid_cli.processors import one_thread
 from ctid_cli.signals.frequency_data import FrequencyData
-from ctid_cli.text import count, probability
+from ctid_cli.text import probability
 
 
 @one_thread
@@ -120,5 +120,5 @@ def _warnings(fit: FrequencyDomainFit, response: ResponseTest) -> Iterator[str]:
         assert fit.law is not None
         yield from of_conditioning(fit, fit.law)
     if fit.law is not None and fit.law.short:
-        worth = f"{count(fit.count, 'value')} are worth {fit.law.effective_count:.2g} independent ones"
-        yield f"The errors of the lines are so correlated that {worth}: standard errors are rough"
+        freedom = f"{fit.law.degrees_of_freedom:.2g} degrees of freedom"
+        yield f"The errors of the lines are so correlated that intervals are those of Student's t with {freedom}: rough"

@@ -1,20 +1,74 @@
-"""Covariance of output-error estimates in white and in coloured noise, and warnings about ill-conditioning."""
+"""Covariance of output-error estimates in white, coloured, rounded and changing noise, and ill-conditioning."""
 
 import re
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.loop_noise import SensitivityFunction
-from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model, fit_residual_noise
+from ctid_cli.inference.noise_model import STEP, NoiseModel, fit_residual_noise
 from ctid_cli.text import listed
 
 #: Beyond this condition number the inverse has no correct digit and is replaced by NaN.
 LARGEST_CONDITION = 1e14
+#: Significance level of a changing variance of the innovations.
+CHANGING = 0.05
+#: Fewest samples for each parameter in the test of a changing variance.
+SAMPLES_PER_PARAMETER = 5
+#: Largest number of harmonics of a rounding error.
+HARMONICS = 50
 
 
-def white_noise_covariance(hessian: Array, squared_error: float, count: int) -> Array:
+class Rounding(NamedTuple):
+    """Step of a rounded output [output unit], and the fitted output at the used samples [output unit]."""
+
+    step: float
+    output: Array
+
+
+class Dispersion(NamedTuple):
+    r"""Covariance of an estimate, and the uncertainty of this covariance.
+
+    A quantity with the gradient g has the variance ``V = g'Cg``. With W_k the changes of C by one standard deviation of
+    the independent parameters of the noise, V has the variance ``sum_k (g'W_k g)^2``, and the quantity over its
+    standard error Student's t distribution with about
+
+    .. math:: \nu = \frac{2 V^2}{\sum_k (g' W_k g)^2}
+
+    degrees of freedom [1]_, which are N - p in white noise.
+
+    References
+    ----------
+    .. [1] F. E. Satterthwaite, "An approximate distribution of estimates of variance components", *Biometrics
+       Bulletin* 2 (1946) 110-114. doi:10.2307/3002019
+    """
+
+    #: Shape (p, p).
+    covariance: Array
+    #: W, shape (k, p, p); empty if C is known.
+    variation: Array
+    noise: NoiseModel | None = None
+    #: Whether the variance of the innovations changes.
+    changing: bool = False
+    #: Whether the error of rounding the output exceeds the noise.
+    rounded: bool = False
+
+    @classmethod
+    def scaled(cls, covariance: Array, freedom: float) -> "Dispersion":
+        """Return that of a covariance known up to a factor, estimated with given degrees of freedom."""
+        if not np.isfinite(freedom):
+            return cls(covariance, np.zeros((0, *covariance.shape)))
+        return cls(covariance, np.sqrt(2.0 / max(freedom, 1.0)) * covariance[None])
+
+
+def undefined(size: int) -> Dispersion:
+    """Return an undefined dispersion."""
+    return Dispersion.scaled(np.full((size, size), np.nan), np.inf)
+
+
+def white_noise_dispersion(hessian: Array, squared_error: float, count: int) -> Dispersion:
     r"""Return the covariance ``s^2 (sum psi psi')^-1`` with ``s^2 = sum eps^2 / (N - p)``.
 
     Valid for a converged estimate of a model that contains the system, and white output noise. Refined instrumental
@@ -23,10 +77,10 @@ def white_noise_covariance(hessian: Array, squared_error: float, count: int) -> 
     size = hessian.shape[0]
     found = unit_inverse(hessian) if count > size else None
     if found is None:
-        return np.full((size, size), np.nan)
+        return undefined(size)
     inverse, scale = found
     covariance: Array = inverse * np.outer(scale, scale) * squared_error / (count - size)
-    return 0.5 * (covariance + covariance.T)
+    return Dispersion.scaled(0.5 * (covariance + covariance.T), count - size)
 
 
 def sandwich(inverse: Array, scale: Array, middle: Array, left: float = 1.0) -> Array:
@@ -53,10 +107,13 @@ def condition_number(hessian: Array) -> float:
     return float(values[-1] / values[0]) if values[0] > 0 else float("inf")
 
 
-def robust_covariance(
-    psi: Sequence[Array], residuals: Sequence[Array], loop: SensitivityFunction | None = None
-) -> tuple[Array, NoiseModel]:
-    r"""Return the covariance ``M^-1 Sigma M^-1`` of an unweighted output-error estimate, and the coloured noise.
+def robust_dispersion(
+    psi: Sequence[Array],
+    residuals: Sequence[Array],
+    loop: SensitivityFunction | None = None,
+    rounding: Sequence[Rounding | None] = (),
+) -> Dispersion:
+    r"""Return the covariance ``M^-1 Sigma M^-1`` of an unweighted output-error estimate in coloured noise.
 
     With noise v independent of the input (open loop) and ``M = sum psi psi'``,
 
@@ -74,20 +131,106 @@ def robust_covariance(
     With feedback from the output to the input the noise is not independent of psi, and the formula is not valid. It is
     valid for the output error of a simulated loop, whose input is the reference. With its sensitivity function S, that
     error is S v, the autoregression is that of v, and ``sum psi S v = sum (S' psi) v``.
+
+    A variance of the innovations that changes with the sensitivities, by Koenker's test, is replaced by their squares
+    (:func:`_changing`), and the error of a coarsely rounded output is added (:func:`_of_rounding`).
     """
     size, count = psi[0].shape[1], sum(block.size for block in residuals)
     found = unit_inverse(sum((block.T @ block for block in psi), np.zeros((size, size)))) if count > size else None
     if found is None:
-        return np.full((size, size), np.nan), fit_noise_model(residuals, max_order=0)
+        return undefined(size)
     inverse, scale = found
-    scaled = [block * scale for block in psi]
-    if loop is None:
-        noise = fit_residual_noise(scaled, residuals)
+    scaled, errors = [block * scale for block in psi], list(residuals)
+    rows = [block @ inverse for block in scaled]
+    if loop is not None:
+        errors = [loop.removed(e) for e in residuals]
+        scaled, rows = [loop.removed(block) for block in scaled], [loop.transposed(block) for block in rows]
+    noise = fit_residual_noise(scaled, errors)
+
+    def covariance(noise: NoiseModel) -> Array:
+        return np.asarray(np.sum([noise.covariance_of(block) for block in rows], axis=0))
+
+    middle = covariance(noise)
+    along = [(covariance(high) - covariance(low)) / (2 * STEP) for low, high in noise.displaced]
+    changing = _changing(rows, errors, noise)
+    if changing is None:
+        variation = [*along, middle * np.sqrt(2.0 / noise.freedom)]
     else:
-        noise = fit_residual_noise([loop.removed(block) for block in scaled], [loop.removed(e) for e in residuals])
-        scaled = [loop.transposed(block) for block in scaled]
-    sigma = sum((noise.covariance_of(block) for block in scaled), np.zeros((size, size)))
-    return sandwich(inverse, scale, sigma), noise
+        middle, variation = middle + changing[0], [*along, *changing[1]]
+    added = [_of_rounding(block, one, noise) for block, one in zip(rows, rounding, strict=False) if one is not None]
+    rounded = any(np.trace(each) > 0.01 * np.trace(middle) for each in added)
+    units = np.outer(scale, scale)
+    whole = np.sum([middle, *added], axis=0) * units
+    return Dispersion(0.5 * (whole + whole.T), np.array(variation) * units, noise, changing is not None, rounded)
+
+
+def _changing(rows: Sequence[Array], errors: Sequence[Array], noise: NoiseModel) -> tuple[Array, list[Array]] | None:
+    r"""Return what a changing variance of the innovations adds to a covariance, and its variation; None without change.
+
+    The estimate is ``sum_t a_t v_t = sum_s g_s e_s`` with the innovations e and the rows g of
+    :meth:`NoiseModel.weights_of`. Koenker's test regresses ``e^2`` on the squares of the columns of g [1]_: other
+    changes of the variance do not matter. Squared innovations over their expectation (HC2) then replace their
+    variance; those of a normal variable have the variance 2/3 of their square.
+
+    References
+    ----------
+    .. [1] R. Koenker, "A note on studentizing a test for heteroscedasticity", *Journal of Econometrics* 17 (1981)
+       107-112. doi:10.1016/0304-4076(81)90062-2
+    """
+    from scipy.special import chdtrc  # slow to import
+
+    size, order, variance = rows[0].shape[1], noise.order, noise.innovation_variance
+    g = np.concatenate([noise.weights_of(block)[order:] for block in rows])
+    squares = np.concatenate([noise.innovations(e)[order:] for e in errors]) ** 2
+    if squares.size < SAMPLES_PER_PARAMETER * size or not variance > 0.0:
+        return None
+    regressors = g**2 / np.maximum((g**2).mean(axis=0), np.finfo(float).tiny)
+    regressors = np.column_stack((np.ones(squares.size), regressors))
+    weights, _, rank, _ = np.linalg.lstsq(regressors, squares, rcond=1e-8)
+    spread = float(np.sum((squares - squares.mean()) ** 2))
+    explained = spread - float(np.sum((squares - regressors @ weights) ** 2))
+    if not (spread > 0.0 and rank > 1 and chdtrc(rank - 1, squares.size * explained / spread) < CHANGING):
+        return None
+    orthonormal = np.linalg.qr(g)[0]
+    expected = squares / np.maximum(1.0 - np.sum(orthonormal**2, axis=1), 0.1)
+    i, j = np.triu_indices(size)
+    products = g[:, i] * g[:, j] * expected[:, None]
+    values, vectors = np.linalg.eigh(2.0 / 3.0 * products.T @ products)
+    variation = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value > 1e-8 * values[-1]:
+            change = np.zeros((size, size))
+            change[i, j] = change[j, i] = np.sqrt(value) * vector
+            variation.append(change)
+    return (g * (expected - variance)[:, None]).T @ g, variation
+
+
+def _of_rounding(rows: Array, rounding: Rounding, noise: NoiseModel) -> Array:
+    r"""Return what the error of rounding the output adds to a covariance.
+
+    The error is a function of the output x before rounding. With step q and an unknown position of the levels, errors
+    at two samples have the covariance
+
+    .. math:: \frac{q^2}{2 \pi^2} \sum_{k \ge 1} \frac{1}{k^2} \cos\Big(2 \pi k \frac{x_t - x_s}{q}\Big)
+              \exp\Big(-4 \pi^2 k^2 \frac{\sigma^2}{q^2}\Big)
+
+    where sigma is the standard deviation of the noise before rounding, which makes the error independent of x; without
+    noise the sum is ``(q^2/2) B_2(\{|x_t - x_s|/q\})`` with Bernoulli's polynomial ``z^2 - z + 1/6`` [1]_.
+
+    References
+    ----------
+    .. [1] B. Widrow and I. Kollár, *Quantization Noise*, Cambridge University Press, 2008.
+    """
+    step, found = rounding.step, np.zeros((rows.shape[1],) * 2)
+    # The residuals contain both errors.
+    before = max(float(noise.first_autocovariances[0]) - step**2 / 12.0, 0.0)
+    for k in range(1, HARMONICS + 1):
+        damping = np.exp(-((2.0 * np.pi * k) ** 2) * before / step**2)
+        if damping < 1e-3:
+            break
+        turned = np.exp(2j * np.pi * k / step * rounding.output) @ rows
+        found += damping / k**2 * np.outer(turned, turned.conj()).real
+    return step**2 / (2.0 * np.pi**2) * found
 
 
 #: A coefficient or delay whose standard error exceeds its magnitude by this factor is called undetermined.
@@ -98,48 +241,33 @@ CLOSE_TO_ONE = 0.999
 NEARLY_SINGULAR = 1e8
 
 
-def describe_conditioning(
-    covariance: Array, estimates: Array, names: Sequence[str], condition_number: float, hessian: Array
-) -> list[str]:
+def describe_conditioning(covariance: Array, names: Sequence[str], hessian: Array) -> list[str]:
     """Return warnings about parameters that the data do not determine.
 
-    Three rules. A standard error is not defined, or the condition number exceeds 1e8: the parameters with more than a
-    tenth of the singular direction (unit diagonal) are named. A standard error exceeds ten times the magnitude of a
-    coefficient or of the delay; initial states and offsets may be zero and are not checked. Two estimates have a
-    correlation beyond 0.999, or one has such a multiple correlation with several others.
+    Names and ``sum psi psi'`` are those of the free directions. Two rules. A standard error is not defined, or the
+    condition number exceeds 1e8: the directions with more than a tenth of the singular one (unit diagonal) are named.
+    Two estimates have a correlation beyond 0.999, or one has such a multiple correlation with several others.
     """
-    variances = np.diag(covariance)
-    defined = bool(np.isfinite(covariance).all() and (variances > 0).all())
-    sentences: list[str] = []
-    singular = not condition_number <= NEARLY_SINGULAR
-    if singular or not defined:
-        group = [names[i] for i in _singular_direction(hessian)]
-        what = listed(group) if 0 < len(group) < len(names) else "the parameters"
-        number = f"condition number {condition_number:.1e}" if np.isfinite(condition_number) else "singular equations"
+    condition = condition_number(hessian)
+    defined = bool(np.isfinite(covariance).all() and (np.diag(covariance) > 0).all())
+    if not condition <= NEARLY_SINGULAR or not defined:
+        group = list(dict.fromkeys(names[i] for i in _singular_direction(hessian)))
+        what = listed(group) if 0 < len(group) < len(set(names)) else "the parameters"
+        number = f"condition number {condition:.1e}" if np.isfinite(condition) else "singular equations"
         start = f"These data do not determine {what} separately ({number})"
         if len(group) == 1:
             start = f"{what} has no detectable effect in these data ({number})"
         end = "their standard errors are not reliable" if defined else "no standard errors can be given"
-        sentences.append(f"{start}; {end}.")
-    if defined:
-        errors = np.sqrt(variances)
-        sentences += _large_errors(estimates, errors, names)
-        # For singular equations the correlations would repeat the warning.
-        sentences += [] if singular else _correlated(covariance / np.outer(errors, errors), names)
-    return sentences
-
-
-def _large_errors(theta: Array, errors: Array, names: Sequence[str]) -> Iterator[str]:
-    for name, value, error in zip(names, theta, errors, strict=True):
-        if re.fullmatch(r"[ab]\d+|delay", name) and error > LARGE_STANDARD_ERROR * abs(value):
-            times = f"{error / abs(value):.2g} times its value" if value else "its value being zero"
-            start = f"{name} = {value:.3g} has a standard error of {error:.3g}, {times}"
-            yield f"{start}: these data do not even determine its sign."
+        return [f"{start}; {end}."]
+    errors = np.sqrt(np.diag(covariance))
+    return list(_correlated(covariance / np.outer(errors, errors), names))
 
 
 def _correlated(correlation: Array, names: Sequence[str]) -> Iterator[str]:
+    """Yield which directions are nearly parallel."""
+
     def warning(group: Sequence[int], how: str, combinations: str) -> str:
-        several = [names[i] for i in group]
+        several = list(dict.fromkeys(names[i] for i in group))
         start = f"These data can hardly distinguish {listed(several)} ({how}): only"
         return f"{start} {combinations} well determined.{_of_delay(several)}"
 

@@ -1,14 +1,14 @@
 """Poles, time constants, frequencies, damping and gain of estimated models, with their standard errors."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
-from ctid_cli.inference.intervals import UncertainValue, normal_quantile
+from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.inference.sensitivities import parts_of
+from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 
@@ -17,29 +17,20 @@ GAIN_UNIT = "output unit/input unit"
 HELD = "It is at a bound: a given one, or one of the admissible models, because the record does not determine it."
 #: A quantity counts as fixed if it changes by less than this fraction for a relative change of 1 of a free pole [-].
 UNMOVED = 1e-6
-#: Standard errors to each side of a quantity with a given gradient by the leading parameters.
-Quantile = Callable[[Array], float]
-
-
-def normal_interval(gradient: Array) -> float:
-    """Return the 95 % quantile of the normal distribution for any quantity."""
-    return normal_quantile()
 
 
 def derived_parameters(
-    model: AdditiveModel | TransferFunction,
-    covariance: Array,
-    quantile: Quantile = normal_interval,
-    tangent: Array | None = None,
+    model: AdditiveModel | TransferFunction, law: Uncertainty, *, level: float = 0.95, held: bool = False
 ) -> tuple[UncertainValue, ...]:
     r"""Return poles, time constants, frequencies, damping and gain of a model or of submodels, by the delta method.
 
-    ``var g = (dg/dtheta) C (dg/dtheta)'`` with analytic derivatives, those of the poles from :func:`pole_jacobian`, and
-    ``g +- z se``. The linearisation only holds where a pole moves little compared with its distance to the others. A
-    pole whose ``z`` standard errors, ``sqrt(var Re p + var Im p)``, reach another pole is called undetermined: its
-    accuracy is NaN and the reason is given. Natural frequency and damping of a pair only need it to be far
-    from the *other* poles: they are regular where the pair meets on the real axis. Quantities that are constant along
-    the tangent, the directions in which the coefficients were free, are fixed and have no standard error.
+    The parameters are the leading ones of ``law``, and ``var g = (dg/dtheta) C (dg/dtheta)'`` with analytic
+    derivatives, those of the poles from :func:`pole_jacobian`, and ``g +- z se``. The linearisation only holds where a
+    pole moves little compared with its distance to the others. A pole whose ``z`` standard errors, ``sqrt(var Re p +
+    var Im p)``, reach another pole is called undetermined: its accuracy is NaN and the reason is given. Natural
+    frequency and damping of a pair only need it to be far from the *other* poles: they are regular where the pair meets
+    on the real axis. If parameters were ``held``, quantities that are constant along the free directions have no
+    standard error.
 
     Each quantity depends on the parameters of its submodel only, so a pole is undetermined only if it cannot be
     distinguished from another one of the same submodel.
@@ -47,8 +38,8 @@ def derived_parameters(
     found: list[UncertainValue] = []
     first, additive = 0, isinstance(model, AdditiveModel)
     # The numerator of a fraction may have leading coefficients that are estimated and zero.
-    for number, part in enumerate(parts_of(model, len(covariance) - model.order - 1), 1):
-        rows = _Rows(covariance, quantile, tangent, first, f"g{number}_" if additive else "")
+    for number, part in enumerate(parts_of(model, len(law.tangent) - model.order - 1), 1):
+        rows = _Rows(law, level, held, first, f"g{number}_" if additive else "")
         a, last = part.denominator, float(part.denominator[-1])
         poles, jacobian = part.pole_slopes()
         rows.add_poles(poles, jacobian, number_lone=not additive)
@@ -72,11 +63,11 @@ def derived_parameters(
 
 @dataclass
 class _Rows:
-    """Quantities that depend on the parameters of one model or submodel, from the covariance of all."""
+    """Quantities that depend on the parameters of one model or submodel."""
 
-    covariance: Array
-    quantile: Quantile
-    tangent: Array | None = None
+    law: Uncertainty
+    level: float
+    held: bool = False
     #: Index of the first parameter of the gradients, and prefix of the names of the quantities.
     first: int = 0
     prefix: str = ""
@@ -84,24 +75,15 @@ class _Rows:
 
     def add(self, name: str, estimate: float, gradient: Array, unit: str, reason: str = "") -> None:
         """Add one quantity, from its gradient; with a reason, it has no standard error."""
-        if self.tangent is not None and not reason:
-            moved = np.abs(gradient @ self.tangent[: gradient.size]).max(initial=0.0)
+        gradient = np.concatenate((np.zeros(self.first), gradient))
+        if self.held and not reason:
+            moved = np.abs(self.law.along(gradient)).max(initial=0.0)
             reason = HELD if moved <= UNMOVED * abs(estimate) else ""
-        variance = float(gradient @ self._own(gradient.size) @ gradient) if np.isfinite(gradient).all() else NAN
-        error = float(np.sqrt(variance)) if variance >= 0 and not reason else NAN
+        error = self.law.error(gradient) if np.isfinite(gradient).all() and not reason else NAN
         if not reason and not np.isfinite(error):
             reason = "The covariance of the coefficients is not defined."
-        reach = self._reach(gradient) if np.isfinite(error) else NAN
+        reach = self.law.quantile(gradient, self.level) if np.isfinite(error) else NAN
         self.found.append(UncertainValue.symmetric(self.prefix + name, estimate, error, unit, reach, reason))
-
-    def _own(self, size: int) -> Array:
-        """Return the covariance of the parameters of a gradient."""
-        own = slice(self.first, self.first + size)
-        return self.covariance[own, own]
-
-    def _reach(self, gradient: Array) -> float:
-        """Return the half-width of the interval of a quantity in standard errors."""
-        return self.quantile(np.concatenate((np.zeros(self.first), gradient)))
 
     def add_mode(
         self, label: str, frequency: float, radial: Array, damping: float, turning: Array, reason: str = ""
@@ -140,13 +122,13 @@ class _Rows:
 
     def _undetermined(self, poles: ComplexArray, k: int, slope: ComplexArray, others: BoolArray) -> str:
         """Return the reason why pole k has no standard error, or an empty string."""
-        if indistinct(poles, k, slope, others, self._own(slope.size), self._reach):
+        if indistinct(poles, k, np.concatenate((np.zeros(self.first), slope)), others, self.law, self.level):
             return "This pole has no standard error: these data cannot distinguish it from another pole."
         return ""
 
 
 def indistinct(
-    poles: ComplexArray, k: int, slope: ComplexArray, others: BoolArray, covariance: Array, quantile: Quantile
+    poles: ComplexArray, k: int, slope: ComplexArray, others: BoolArray, law: Uncertainty, level: float
 ) -> bool:
     """Return whether the interval of pole k, with the given derivatives, reaches another pole."""
     if not others.any():
@@ -154,9 +136,8 @@ def indistinct(
     distance = float(np.abs(poles[others] - poles[k]).min())
     if distance <= 1e-7 * float(np.abs(poles).max()) or not np.isfinite(slope).all():
         return True
-    with np.errstate(invalid="ignore"):
-        spread = float(np.sqrt(slope.real @ covariance @ slope.real + slope.imag @ covariance @ slope.imag))
-    return quantile(slope.real) * spread >= distance
+    spread = math.hypot(law.error(slope.real), law.error(slope.imag))
+    return law.quantile(slope.real, level) * spread >= distance
 
 
 def modes_of(poles: ComplexArray) -> list[tuple[float, float | None]]:

@@ -313,7 +313,7 @@ class FittedModel(ABC):
             f"delay = {model.delay!r};",
             f"{name} = {kind}(numerator, denominator, '{DELAYS[kind]}', delay, 'TimeUnit', '{unit}');",
             f"% covariance of the estimates of {', '.join(found.parametric.names)}:",
-            *(f"%   {_row(row)}" for row in found.reported),
+            *(f"%   {_row(row)}" for row in found.law.covariance),
             *(f"% {mark}" for mark in self.marks(time_unit)),
         ]
         return "\n".join(lines) + "\n"
@@ -363,7 +363,7 @@ class FittedModel(ABC):
                 f"{name} *= control.TransferFunction(*control.pade(delay, {pade}))  # the delay, approximately"
             )
         lines.append(f"# covariance of the estimates of {', '.join(found.parametric.names)}:")
-        lines += [f"#   {_row(row)}" for row in found.reported]
+        lines += [f"#   {_row(row)}" for row in found.law.covariance]
         return "\n".join([*lines, *(f"# {mark}" for mark in self.marks())]) + "\n"
 
 

@@ -17,11 +17,17 @@ def normal_quantile(level: float = 0.95) -> float:
     return NormalDist().inv_cdf(0.5 + level / 2)
 
 
-def student_quantile(degrees_of_freedom: float, level: float = 0.95) -> float:
-    """Return the half-width of a two-sided interval of Student's t distribution [standard errors]."""
+def student_quantiles(degrees_of_freedom: Array, level: float = 0.95) -> Array:
+    """Return the half-widths of two-sided intervals of Student's t distribution [standard errors]."""
     from scipy.special import stdtrit
 
-    return float(stdtrit(degrees_of_freedom, 0.5 + level / 2))
+    known = np.isinf(degrees_of_freedom)
+    return np.where(known, normal_quantile(level), stdtrit(np.where(known, 1.0, degrees_of_freedom), 0.5 + level / 2))
+
+
+def student_quantile(degrees_of_freedom: float, level: float = 0.95) -> float:
+    """Return the half-width of a two-sided interval of Student's t distribution [standard errors]."""
+    return float(student_quantiles(np.array([degrees_of_freedom]), level)[0])
 
 
 def robust_deviation(x: Array) -> float:

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -134,19 +133,6 @@ class Estimated:
     parametric: Parametric
     law: Uncertainty
 
-    @cached_property
-    def reported(self) -> Array:
-        """Covariance of all parameters; NaN if it is not defined or a parameter is fixed, shape (p, p)."""
-        return self.law.covariance
-
-    @cached_property
-    def covariance(self) -> Array:
-        """Covariance with fixed parameters as known."""
-        held = np.isnan(np.diag(self.reported))
-        if held.all():
-            return self.reported
-        return np.where(held[:, None] | held, 0.0, self.reported)
-
     @property
     def degrees_of_freedom(self) -> float:
         """Degrees of freedom of the t distribution of the draws [-]; infinite for the normal distribution."""
@@ -154,30 +140,24 @@ class Estimated:
 
     def intervals(self, slopes: Array, level: float) -> tuple[Array, Array]:
         """Return standard errors and half-widths of quantities from their gradients, shape (N, p)."""
-        with np.errstate(invalid="ignore"):
-            variances = np.maximum(np.einsum("ni,ij,nj->n", slopes, self.covariance, slopes), 0.0)
-        errors = np.asarray(np.sqrt(variances))
+        errors = self.law.errors(slopes)
         return errors, self.law.reach(slopes, level) * errors
 
     def of_parts(self, slopes: ComplexArray) -> Array:
         """Return the covariances of real and imaginary parts from their gradients, shape (N, 2, 2)."""
-        parts = np.stack((slopes.real, slopes.imag), axis=1)
-        return np.asarray(np.einsum("nki,ij,nlj->nkl", parts, self.covariance, parts))
-
-    @property
-    def linear_only(self) -> bool:
-        """Whether there is no covariance to draw parameters with."""
-        return not np.isfinite(self.covariance).all()
+        own = self.law.along(slopes)
+        parts = np.stack((own.real, own.imag), axis=1)
+        return np.asarray(np.einsum("nki,ij,nlj->nkl", parts, self.law.free_covariance, parts))
 
     def draws(self) -> Iterator[Parametric]:
         """Yield models with drawn parameters, without invalid ones."""
         mine, _ = self.parametric.free
-        values, vectors = np.linalg.eigh(self.covariance[np.ix_(mine, mine)])
+        values, vectors = np.linalg.eigh(self.law.free_covariance)
         rng = np.random.default_rng(SEED)
-        normal = rng.standard_normal((DRAWS, mine.size))
+        normal = rng.standard_normal((DRAWS, values.size))
         if np.isfinite(self.degrees_of_freedom):
             normal /= np.sqrt(rng.chisquare(self.degrees_of_freedom, DRAWS) / self.degrees_of_freedom)[:, None]
-        for change in normal @ (vectors * np.sqrt(np.maximum(values, 0.0))).T:
+        for change in normal @ (self.law.tangent[mine] @ (vectors * np.sqrt(np.maximum(values, 0.0)))).T:
             with suppress(DataError):
                 yield self.parametric.at(change)
 
@@ -200,7 +180,7 @@ class Estimated:
         _check(level, bands)
         value, slopes = model.simulated(signal, t), model.output_slopes(signal, t)
         errors, half = self.intervals(slopes, level)
-        if bands == "linearised" or self.linear_only:
+        if bands == "linearised" or not self.law.defined:
             lower, upper = value - half, value + half
         else:
             behind = (one.derivative if model.differentiated else one for one in self.draws())
@@ -219,8 +199,10 @@ class Estimated:
             relative = slopes / value[:, None]
         gain_error, wide = self.intervals(relative.real, level)
         phase_error, turn = self.intervals(relative.imag, level)
-        if bands == "linearised" or self.linear_only:
-            lower, upper, low_phase, high_phase = gain * np.exp(-wide), gain * np.exp(wide), phase - turn, phase + turn
+        if bands == "linearised" or not self.law.defined:
+            with np.errstate(over="ignore", invalid="ignore"):
+                lower, upper = gain * np.exp(-wide), gain * np.exp(wide)
+            low_phase, high_phase = phase - turn, phase + turn
         else:
             drawn = np.array([one.model.frequency_response(w) for one in self.draws()])
             with np.errstate(invalid="ignore", divide="ignore"):
@@ -251,7 +233,7 @@ class Estimated:
         covariance = self.of_parts(slopes)
         for k in range(value.size):
             others = np.arange(value.size) != k
-            if indistinct(value, k, slopes[k], others, self.covariance, lambda row: self.law.quantile(row, level)):
+            if indistinct(value, k, slopes[k], others, self.law, level):
                 covariance[k] = np.nan
         with np.errstate(invalid="ignore"):
             errors = np.sqrt(np.maximum(np.einsum("nkk->nk", covariance), 0.0))

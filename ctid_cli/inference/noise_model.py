@@ -28,6 +28,10 @@ ORDERS, RISES = 8, 3
 INSIDE = 0.9999
 #: Fisher scoring ends at a predicted decrease of the criterion below this, or after this number of steps.
 PROMISE, STEPS = 1e-10, 60
+#: Difference of noise models for derivatives [standard deviations of a parameter].
+STEP = 0.01
+#: Least curvature of the criterion along a parameter, as a share of the largest.
+FLAT = 1e-3
 #: Residuals whose unexplained part is below this fraction are rounding errors.
 NO_NOISE = 1e-12
 #: Least number of samples per order; the order is also at most half of the shortest experiment.
@@ -68,6 +72,11 @@ class NoiseModel:
     innovation_variance: float
     #: Negative partial correlations at the lags 1 ... r [-], if known, shape (order,).
     partial: Array = field(default_factory=lambda: np.zeros(0))
+    #: Degrees of freedom of the innovation variance for given coefficients [-].
+    freedom: float = np.inf
+    #: Pairs of models displaced by ``-STEP`` and ``STEP`` standard deviations along independent directions of the
+    #: uncertain coefficients, with the innovation variances that are then most likely.
+    displaced: tuple[tuple["NoiseModel", "NoiseModel"], ...] = field(default=(), repr=False)
 
     @property
     def order(self) -> int:
@@ -84,6 +93,14 @@ class NoiseModel:
         """Return the innovations e of successive samples of v, which is zero before the first one."""
         white: Array = np.convolve(v, self.coefficients)[: v.size]
         return white
+
+    def weights_of(self, columns: Array) -> Array:
+        """Return rows g with ``columns' v = sum g(s) e(s)``, for successive samples of v that is zero before them."""
+        from ctid_cli.inference.noise_kernels import autoregress  # numba is slow to import
+
+        backwards = np.vstack((np.zeros((self.order, columns.shape[1])), columns[::-1]))
+        autoregress(backwards, self.coefficients)
+        return backwards[self.order :][::-1]
 
     def covariance_of(self, columns: Rows) -> Array:
         r"""Return the covariance of the products of successive samples of v with columns.
@@ -211,7 +228,9 @@ def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array]) -> Nois
     """Return the REML model of the noise from the residuals of a fit with sensitivities psi of full rank.
 
     The order has the least AICc among those up to 8, until it has risen three times, and the one that Akaike's
-    criterion chooses for the Yule-Walker model, for noise with a long memory.
+    criterion chooses for the Yule-Walker model, for noise with a long memory. The inverse hyperbolic tangents of the
+    partial correlations are nearly normal, with twice the inverse of the second derivatives of the criterion as
+    covariance.
     """
     stacked, errors = np.concatenate(psi), np.concatenate(residuals)
     orthonormal = np.linalg.qr(stacked / np.linalg.norm(stacked, axis=0))[0]
@@ -250,9 +269,31 @@ def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array]) -> Nois
             break
     if guess.size > ORDERS and penalised(far := _scored(at, guess)) < least:
         best = far
-    c, _, covariances = levinson(best)
-    variance = at(best).variance * power
-    return NoiseModel(c, covariances * variance, variance)
+
+    def model(partial: Array, displaced: tuple[tuple[NoiseModel, NoiseModel], ...] = ()) -> NoiseModel:
+        c, _, covariances = levinson(partial)
+        variance = at(partial).variance * power
+        return NoiseModel(c, covariances * variance, variance, partial, float(count - size + 1), displaced)
+
+    z = np.arctanh(best)
+    return model(best, tuple((model(np.tanh(z - step)), model(np.tanh(z + step))) for step in _steps(at, z)))
+
+
+def _steps(at: Callable[[Array], _Likelihood], z: Array) -> list[Array]:
+    """Return steps of ``STEP`` standard deviations along independent directions of z."""
+    if not z.size:
+        return []
+
+    def gradient(z: Array) -> Array:
+        return np.asarray(at(np.tanh(z)).gradient / np.cosh(z) ** 2)
+
+    small = STEP * np.eye(z.size)
+    curvature = np.array([(gradient(z + step) - gradient(z - step)) / (2 * STEP) for step in small])
+    if not np.isfinite(curvature).all():
+        return []
+    values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
+    values = np.maximum(values, FLAT * max(values[-1], 1.0))
+    return [STEP * np.sqrt(2.0 / value) * vector for value, vector in zip(values, vectors.T, strict=True)]
 
 
 def _scored(at: Callable[[Array], _Likelihood], start: Array) -> Array:
@@ -278,11 +319,17 @@ def _scored(at: Callable[[Array], _Likelihood], start: Array) -> Array:
 
 
 def _products(blocks: Sequence[Array], order: int) -> Array:
-    """Return D of all pairs of lags."""
+    """Return D of all pairs of lags: of a pair with one difference, they differ by products at both ends."""
     size = blocks[0].shape[1]
     products = np.zeros((order + 1, order + 1, size, size))
+    for block in blocks:
+        for k in range(order + 1):
+            n = len(block) - k
+            found = block[:n].T @ block[k:]
+            for i in range(order + 1 - k):
+                products[i, i + k] += found
+                found = found - np.outer(block[i], block[i + k]) - np.outer(block[n - 1 - i], block[n + k - 1 - i])
     for i in range(order + 1):
-        for j in range(i + 1):
-            products[i, j] = sum(block[i : len(block) - j].T @ block[j : len(block) - i] for block in blocks)
-            products[j, i] = products[i, j].T
+        for j in range(i):
+            products[i, j] = products[j, i].T
     return products

@@ -1,24 +1,25 @@
 """Standard errors and intervals of an estimate, for white or coloured noise."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
-from ctid_cli.inference.covariance import robust_covariance, white_noise_covariance
+from ctid_cli.inference.covariance import Dispersion, Rounding, robust_dispersion, white_noise_dispersion
 from ctid_cli.inference.innovations import SampledNoise
-from ctid_cli.inference.intervals import student_quantile
+from ctid_cli.inference.intervals import student_quantiles
 from ctid_cli.inference.loop_noise import SensitivityFunction
 from ctid_cli.inference.noise_model import NoiseModel
-from ctid_cli.inference.residual_tests import all_white
 from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.progress import report, reported
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record
 
+Number = TypeVar("Number", np.float64, np.complex128)
 #: Fixed seed of the noise, for reproducible results.
 SEED = 20140801
 #: Reported step of a bootstrap; and a function that is called with the number of finished draws and their total.
@@ -68,13 +69,13 @@ def bootstrap_t(
         drawn = drawn if loop is None else [loop.filtered(v) for v in drawn]
         errors[k] = solve @ np.concatenate(drawn)
         left = [v - block @ errors[k] for v, block in zip(drawn, psi, strict=True)]
-        covariances[k] = robust_covariance(psi, left, loop)[0]
+        covariances[k] = robust_dispersion(psi, left, loop).covariance
         report(DRAW, k + 1, draws)
     return BootstrapT(errors, covariances)
 
 
-#: Assumption on the noise for standard errors; ``auto`` is ``white`` unless whiteness of the residuals is rejected,
-#: ``sandwich`` an earlier name of ``robust``.
+#: Assumption on the noise for standard errors; ``auto`` is ``robust``, and ``white`` if that finds white noise;
+#: ``sandwich`` is an earlier name of ``robust``.
 Covariance = Literal["auto", "white", "robust", "bootstrap", "sandwich"]
 #: The formula used; with ``biased`` there is no standard error (`BIASED`).
 Formula = Literal["white", "robust", "bootstrap", "biased"]
@@ -94,17 +95,30 @@ class Uncertainty:
     #: Directions in which the parameters are free, shape (p, f), and the covariance along them, shape (f, f).
     tangent: Array
     free_covariance: Array
-    #: Effective number of samples [-].
-    effective_count: float
+    #: Changes of that covariance by one standard deviation of the parameters of the noise, shape (k, f, f).
+    variation: Array = field(repr=False, default_factory=lambda: np.zeros((0, 0, 0)))
     bootstrap: BootstrapT | None = None
+    #: Whether the variance of the noise changes, and whether rounding of the output matters.
+    changing: bool = False
+    rounded: bool = False
+
+    @classmethod
+    def of(cls, kind: Formula, tangent: Array, found: Dispersion) -> "Uncertainty":
+        """Return the distribution for a covariance along the tangent."""
+        return cls(kind, tangent, found.covariance, found.variation, changing=found.changing, rounded=found.rounded)
 
     @classmethod
     def known(cls, covariance: Array) -> "Uncertainty":
         """Return the distribution of normal estimates with a known covariance, NaN for fixed parameters."""
         free = np.flatnonzero(np.isfinite(np.diag(covariance)))
         if not free.size:
-            return cls("white", np.eye(len(covariance)), covariance, np.inf)
-        return cls("white", np.eye(len(covariance))[:, free], covariance[np.ix_(free, free)], np.inf)
+            return cls("white", np.eye(len(covariance)), covariance)
+        return cls("white", np.eye(len(covariance))[:, free], covariance[np.ix_(free, free)])
+
+    @property
+    def defined(self) -> bool:
+        """Whether there are standard errors."""
+        return bool(np.isfinite(self.free_covariance).all())
 
     @property
     def covariance(self) -> Array:
@@ -114,20 +128,44 @@ class Uncertainty:
         covariance[held] = covariance[:, held] = np.nan
         return np.asarray(covariance)
 
-    @property
-    def spare(self) -> float:
-        """Effective number of samples minus number of parameters [-]."""
-        return self.effective_count - len(self.free_covariance)
+    def along(self, gradients: NDArray[Number]) -> NDArray[Number]:
+        """Return derivatives of quantities by the free directions, from those by the leading parameters."""
+        return np.asarray(gradients @ self.tangent[: gradients.shape[-1]])
+
+    def errors(self, gradients: Array) -> Array:
+        """Return the standard errors of quantities with these gradients by the leading parameters, shape (N,)."""
+        own = self.along(gradients)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", own, self.free_covariance, own), 0.0)))
+
+    def error(self, gradient: Array) -> float:
+        """Return the standard error of a quantity with this gradient by the leading parameters."""
+        return float(self.errors(gradient[None])[0])
+
+    def freedom(self, own: Array) -> Array:
+        """Return Student's degrees of freedom of quantities from derivatives by the free directions, shape (N,)."""
+        if not self.variation.size:
+            return np.full(len(own), np.inf)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            variances = np.einsum("ni,ij,nj->n", own, self.free_covariance, own)
+            changes = np.einsum("ni,kij,nj->kn", own, self.variation, own, optimize=True)
+            found = 2.0 * variances**2 / np.sum(changes**2, axis=0)
+        return np.asarray(np.maximum(np.nan_to_num(found, nan=np.inf), LEAST_FREEDOM))
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Degrees of freedom of Student's t [-]."""
-        return max(LEAST_FREEDOM, self.spare)
+        """Least degrees of freedom of Student's t of a parameter [-]."""
+        return float(self.freedom(self.tangent[self.tangent.any(axis=1)]).min(initial=np.inf))
+
+    @property
+    def effective_count(self) -> float:
+        """Number of samples of white noise with these degrees of freedom [-]."""
+        return self.degrees_of_freedom + len(self.free_covariance)
 
     @property
     def short(self) -> bool:
         """Whether the record is too short for its noise model."""
-        return self.kind in ("robust", "bootstrap") and self.spare < ENOUGH_FREEDOM
+        return self.kind in ("robust", "bootstrap") and self.degrees_of_freedom < ENOUGH_FREEDOM
 
     def quantile(self, gradient: Array, level: float = 0.95) -> float:
         """Return the half-width in standard errors of a quantity with this gradient by the leading parameters."""
@@ -139,9 +177,9 @@ class Uncertainty:
 
     def reach(self, gradients: Array, level: float = 0.95) -> Array:
         """Return the half-widths in standard errors of quantities with these gradients, shape (N,)."""
+        own = self.along(gradients)
         if self.bootstrap is None:
-            return np.full(len(gradients), student_quantile(self.degrees_of_freedom, level))
-        own = gradients @ self.tangent[: gradients.shape[1]]
+            return student_quantiles(self.freedom(own), level)
         return np.array([self.bootstrap.quantile(row, level) for row in own])
 
     def transformed(self, jacobian: Array) -> "Uncertainty":
@@ -151,7 +189,7 @@ class Uncertainty:
     @property
     def in_ignored_loop(self) -> "Uncertainty":
         """Uncertainty if the fit ignores the loop of its record: undefined, unless the residuals are white."""
-        if self.kind == "white" or not np.isfinite(self.free_covariance).all():
+        if self.kind == "white" or not self.defined:
             return self
         return replace(self.undefined, kind="biased", bootstrap=None)
 
@@ -170,6 +208,7 @@ def estimate_uncertainty(
     *,
     tangent: Array | None = None,
     loop: SensitivityFunction | None = None,
+    rounding: Sequence[Rounding | None] = (),
 ) -> Uncertainty:
     """Return the uncertainty of an output-error estimate from sensitivities and residuals of each experiment.
 
@@ -178,19 +217,17 @@ def estimate_uncertainty(
     """
     basis = np.eye(psi[0].shape[1]) if tangent is None else tangent
     free = psi if tangent is None else [block @ tangent for block in psi]
-    count = sum(block.size for block in residuals)
-    effective, bootstrap = float(count), None
-    if kind == "white" or (kind == "auto" and all_white(residuals)):
+    if kind == "white":
         hessian = np.sum([block.T @ block for block in free], axis=0)
-        found = white_noise_covariance(hessian, sum(float(e @ e) for e in residuals), count)
-        kind = "white"
-    else:
-        found, noise = robust_covariance(free, residuals, loop)
-        effective = noise.effective_count(count)
-        if kind == "bootstrap" and np.isfinite(found).all():
-            bootstrap = bootstrap_t(free, noise, draws, loop=loop)
-        kind = "robust" if bootstrap is None else "bootstrap"
-    return Uncertainty(kind, basis, found, effective, bootstrap)
+        count = sum(block.size for block in residuals)
+        found = white_noise_dispersion(hessian, sum(float(e @ e) for e in residuals), count)
+        return Uncertainty.of("white", basis, found)
+    found = robust_dispersion(free, residuals, loop, rounding)
+    white = found.noise is None or not (found.noise.order or found.changing or found.rounded)
+    law = Uncertainty.of("white" if kind == "auto" and white else "robust", basis, found)
+    if kind == "bootstrap" and law.defined and found.noise is not None:
+        return replace(law, kind="bootstrap", bootstrap=bootstrap_t(free, found.noise, draws, loop=loop))
+    return law
 
 
 #: Largest shift of the ends of a reliable interval, in half-widths. Measured medians, records of 600 samples after a
@@ -224,9 +261,7 @@ def shifts_of_ends(
     .. [1] D. M. Bates and D. G. Watts, *Nonlinear Regression Analysis and Its Applications*, Wiley, 1988, chapter 7.
     """
     covariance, reach = law.covariance, law.quantiles()
-    found = np.full(len(covariance), np.nan)
-    with np.errstate(invalid="ignore"):
-        errors = np.sqrt(np.diag(covariance))
+    found, errors = np.full(len(covariance), np.nan), law.errors(np.eye(len(covariance)))
     mine = model.free[0]
     free = np.concatenate([slopes @ law.tangent for slopes in psi])
     here = [

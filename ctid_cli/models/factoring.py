@@ -93,6 +93,26 @@ def pole_jacobian(denominator: ArrayLike, poles: ArrayLike) -> ComplexArray:
     return jacobian
 
 
+def section_basis(denominator: ArrayLike, size: int) -> Array:
+    """Return polynomials of degrees 0 to ``size - 1`` as columns of descending coefficients, shape (size, size).
+
+    They are the products of ever more sections of a denominator, the slowest first, and s times each product of a pair:
+    over this denominator their responses to an input differ, unlike those of powers of s.
+    """
+    product, found = np.ones(1), list[Array]()
+    roots = sorted_roots(np.asarray(denominator, dtype=float))
+    for pole in sorted(roots[roots.imag >= 0].tolist(), key=abs):
+        found.append(product)
+        if pole.imag:
+            found.append(np.append(product, 0.0))
+        section = [1.0, -2.0 * pole.real, abs(pole) ** 2] if pole.imag else [1.0, -pole.real]
+        product = np.convolve(product, section)
+    while len(found) < size:
+        found.append(product)
+        product = np.append(product, 0.0)
+    return np.column_stack([np.pad(each, (size - each.size, 0)) for each in found[:size]])
+
+
 def _slope_at_roots(p: ComplexArray) -> ComplexArray:
     """Return ``A'(p_k)`` of a monic polynomial as a product over the other roots, which avoids cancellation."""
     distances = p[:, None] - p[None, :]

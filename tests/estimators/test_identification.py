@@ -9,7 +9,7 @@ from ctid_cli.estimators.identification import costs_about_delay
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.identification.identify import identify
-from ctid_cli.inference.covariance import robust_covariance
+from ctid_cli.inference.covariance import robust_dispersion
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.intervals import student_quantile
 from ctid_cli.models.additive import Term
@@ -61,11 +61,12 @@ def test_white_residuals_keep_the_classical_covariance():
 def test_coloured_residuals_take_the_sandwich():
     result = identify([record_of(colour=0.9)], OPTIONS)
     assert result.uncertainty.kind == "robust"
-    expected, noise = robust_covariance(result.fit.sensitivities, result.fit.residuals)
-    np.testing.assert_allclose(result.uncertainty.covariance, expected, rtol=1e-9)
+    found = robust_dispersion(result.fit.sensitivities, result.fit.residuals)
+    np.testing.assert_allclose(result.uncertainty.covariance, found.covariance, rtol=1e-9)
     b0 = by_name(result)["b0"]
     assert b0.standard_error > 1.5 * np.sqrt(np.diag(result.fit.uncertainty("white").covariance))[1]
-    reach = student_quantile(noise.effective_count(1000) - 3)
+    freedom = 2 * found.covariance[1, 1] ** 2 / np.sum(found.variation[:, 1, 1] ** 2)
+    reach = student_quantile(freedom)
     assert b0.high - b0.estimate == pytest.approx(reach * b0.standard_error)
     assert not result.tests[0].white
     assert len(result.warnings) == 1

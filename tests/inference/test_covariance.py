@@ -10,8 +10,8 @@ from scipy.signal import lfilter
 from ctid_cli.inference.covariance import (
     condition_number,
     describe_conditioning,
-    robust_covariance,
-    white_noise_covariance,
+    robust_dispersion,
+    white_noise_dispersion,
 )
 from ctid_cli.inference.loop_noise import SensitivityFunction
 from ctid_cli.inference.noise_model import fit_residual_noise
@@ -27,7 +27,7 @@ def test_covariance_is_that_of_linear_least_squares(seed, exponents):
     # s^2 (Psi' Psi)^-1 by an orthogonal decomposition, for parameters of any units.
     psi = sensitivities(seed, 10.0 ** np.array(exponents))
     p = len(exponents)
-    covariance = white_noise_covariance(psi.T @ psi, 7.0, 40)
+    covariance = white_noise_dispersion(psi.T @ psi, 7.0, 40).covariance
     r_inverse = np.linalg.inv(np.linalg.qr(psi / np.linalg.norm(psi, axis=0))[1])
     scale = 1 / np.linalg.norm(psi, axis=0)
     expected = r_inverse @ r_inverse.T * np.outer(scale, scale) * 7.0 / (40 - p)
@@ -41,13 +41,13 @@ def test_covariance_is_that_of_linear_least_squares(seed, exponents):
     [np.ones((2, 2)), np.diag([1.0, 0.0]), np.diag([1.0, np.nan]), np.array([[1.0, 1 - 1e-16], [1 - 1e-16, 1.0]])],
 )
 def test_singular_matrices_have_no_covariance(hessian):
-    assert np.isnan(white_noise_covariance(hessian, 1.0, 40)).all()
+    assert np.isnan(white_noise_dispersion(hessian, 1.0, 40).covariance).all()
     assert condition_number(hessian) > 1e14
 
 
 def test_no_degrees_of_freedom_no_covariance():
-    assert np.isnan(white_noise_covariance(np.eye(3), 1.0, 3)).all()
-    assert white_noise_covariance(np.eye(3), 1.0, 4)[0, 0] == 1.0
+    assert np.isnan(white_noise_dispersion(np.eye(3), 1.0, 3).covariance).all()
+    assert white_noise_dispersion(np.eye(3), 1.0, 4).covariance[0, 0] == 1.0
 
 
 def regressors(count, seed=0, pole=0.95):
@@ -67,7 +67,7 @@ def largest_relative_error(covariance, expected):
 
 
 def covariance_of(psi, residuals):
-    return robust_covariance(psi, residuals)[0]
+    return robust_dispersion(psi, residuals).covariance
 
 
 def test_is_the_double_sum_over_all_pairs_of_samples():
@@ -82,7 +82,8 @@ def test_in_a_loop_noise_passes_the_sensitivity_function():
     loop = SensitivityFunction.of(np.array([1.0, 1.25, 0.3]), np.array([0.9 + 0.2j, 0.9 - 0.2j, 0.0]))
     psi, v = regressors(200), noise(np.random.default_rng(1), 200)
     S = toeplitz(lfilter(np.poly([1.0, 0.8, 0.3]), np.poly(loop.poles), np.eye(200)[0]), np.zeros(200))
-    covariance, model = robust_covariance([psi], [S @ v], loop)
+    found = robust_dispersion([psi], [S @ v], loop)
+    covariance, model = found.covariance, found.noise
     R, M = toeplitz(autocovariance(model, 200)), np.linalg.inv(psi.T @ psi)
     # By the autoregression of v, with the sensitivities of its open loop.
     own = fit_residual_noise([np.linalg.solve(S, psi)], [v])
@@ -95,7 +96,7 @@ def test_white_residuals_give_the_white_formula():
     v = np.random.default_rng(4).standard_normal(200)
     v -= psi @ np.linalg.lstsq(psi, v)[0]
     assert fit_residual_noise([psi], [v]).order == 0  # then it is exact, N - p included
-    expected = white_noise_covariance(psi.T @ psi, v @ v, 200)
+    expected = white_noise_dispersion(psi.T @ psi, v @ v, 200).covariance
     assert largest_relative_error(covariance_of([psi], [v]), expected) < 1e-12
 
 

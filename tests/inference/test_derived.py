@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.inference.derived import derived_parameters
+from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.transfer_function import TransferFunction
 
@@ -28,7 +29,8 @@ MODELS = {
 
 
 def by_name(model, covariance, **options):
-    return {row.name: row for row in derived_parameters(model, np.asarray(covariance), **options)}
+    law = Uncertainty.known(np.asarray(covariance))
+    return {row.name: row for row in derived_parameters(model, law, **options)}
 
 
 def theta_of(model):

@@ -7,8 +7,6 @@ from scipy.optimize import approx_fprime
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from ctid_cli.inference.covariance import robust_covariance
-from ctid_cli.inference.intervals import student_quantile
 from ctid_cli.inference.noise_model import (
     NoiseModel,
     _products,
@@ -17,6 +15,7 @@ from ctid_cli.inference.noise_model import (
     levinson,
     restricted_likelihood,
 )
+from ctid_cli.inference.uncertainty import estimate_uncertainty
 from tests.inference.autoregression import autocovariance
 
 
@@ -111,16 +110,16 @@ def test_the_order_may_be_long_as_a_season():
     assert model.coefficients[12] == pytest.approx(-0.8, abs=0.05)
 
 
-def test_intervals_of_short_records_of_slow_noise_cover():
-    """AR(1) of .95 and 600 samples (effective count 15): of 200 runs 95 % -+ 3.5 are within the interval."""
+@pytest.mark.parametrize(("pole", "count"), [(0.7, 60), (0.95, 600)])
+def test_intervals_of_short_records_of_coloured_noise_cover(pole, count):
+    """AR(1) noise, records that are worth about 10 and 15 independent samples: of 300 runs 95 % -+ 4 are inside."""
     rng = np.random.default_rng(2)
-    psi = slow_rows(600, rng)
+    psi = slow_rows(count, rng)
     covered = np.zeros(4)
-    for _ in range(200):
-        v = noise(rng, [1.0, -0.95], 600)
+    for _ in range(300):
+        v = noise(rng, [1.0, -pole], count)
         error = np.linalg.lstsq(psi, v)[0]
-        covariance, model = robust_covariance([psi], [v - psi @ error])
-        reach = student_quantile(max(2.0, model.effective_count(600) - 4))
-        covered += np.abs(error) < reach * np.sqrt(np.diag(covariance))
-    low, high = binom.ppf([5e-4, 1 - 5e-4], 200, 0.95)
+        law = estimate_uncertainty([psi], [v - psi @ error], "auto")
+        covered += np.abs(error) < law.quantiles() * np.sqrt(np.diag(law.covariance))
+    low, high = binom.ppf([5e-4, 1 - 5e-4], 300, 0.95)
     assert ((low <= covered) & (covered <= high)).all()
