@@ -233,7 +233,7 @@ class BoundedSearch:
                 row[layout.names.index(name)] = slope
         # In the units of the parameters, which differ by orders of magnitude.
         scale = np.abs(theta) + (theta == 0.0)
-        within = slopes * scale @ free
-        rows = within / np.maximum(np.linalg.norm(within, axis=1, keepdims=True), 1e-300)
-        inner = (free * scale[:, None]) @ null_space(rows)
+        free = free / np.max(np.abs(free) / scale[:, None], axis=0)
+        within = slopes @ free
+        inner = free @ null_space(within / np.maximum(np.linalg.norm(within, axis=1, keepdims=True), 1e-300))
         return np.asarray(inner / np.linalg.norm(inner, axis=0))

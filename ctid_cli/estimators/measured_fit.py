@@ -16,6 +16,7 @@ from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.noise_search import joint_optimum
 from ctid_cli.estimation.optimum.best_model import Begin, Optimum
 from ctid_cli.estimation.optimum.box import Box
+from ctid_cli.estimation.optimum.chain import block_diagonal
 from ctid_cli.estimation.optimum.known import null_space
 from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimation.parameter_layout import Degrees, Layout
@@ -30,7 +31,7 @@ from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_cova
 from ctid_cli.inference.repetition import Equivalent
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
 from ctid_cli.inference.uncertainty import DRAW, DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
-from ctid_cli.models.factoring import section_basis
+from ctid_cli.models.factoring import section_basis, section_slopes
 from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of
 from ctid_cli.progress import calling
 from ctid_cli.signals.noise import ArmaNoise
@@ -483,21 +484,27 @@ def _given(layout: Layout, measured: MeasuredRecords) -> BoolArray:
     return fixed
 
 
-def _tangent(layout: Layout, found: Optimum, fixed: BoolArray) -> Array:
+def _tangent(layout: Layout, optimum: Optimum, known: BoolArray) -> Array:
     """Return the directions that preserve known parameters and keep poles and delays in the admissible set.
 
-    Columns are changes by the logarithms of speeds and dampings of the poles, and of the outputs of a cascade of
-    sections of the poles, for numerators and initial states: directions along coefficients may be nearly parallel.
+    Columns are changes by the logarithms of the coefficients of sections, and for numerators and initial states the
+    products of sections: directions along coefficients may be nearly parallel.
     """
-    degrees, fixed = layout.degrees, fixed.copy()
-    for k in found.delays_at_bound:
+    degrees, fixed = layout.degrees, known.copy()
+    for k in optimum.delays_at_bound:
         fixed[degrees.delay(k)] = True
+    slopes = optimum.pole_slopes
+    if not optimum.held_poles.size:
+        if not isinstance(degrees, Degrees):
+            return np.eye(layout.size)[:, ~fixed]
+        slopes = block_diagonal([section_slopes(each) for each in optimum.denominators])
+        slopes = slopes @ null_space(slopes[known[degrees.denominators]])
     fixed[degrees.denominators] = True
-    moving = np.zeros((layout.size, found.pole_slopes.shape[1]))
-    moving[degrees.denominators] = found.pole_slopes
+    moving = np.zeros((layout.size, slopes.shape[1]))
+    moving[degrees.denominators] = slopes
     columns = [moving]
     if isinstance(degrees, Degrees):
-        each = found.denominators
+        each = optimum.denominators
         blocks = [(own, each[0 if degrees.common else k]) for k, own in enumerate(degrees.b)]
         if layout.initial_state:
             ends = np.cumsum([0, *degrees.orders])
@@ -505,9 +512,11 @@ def _tangent(layout: Layout, found: Optimum, fixed: BoolArray) -> Array:
                 states = (slice(first + low, first + high) for low, high in pairwise(ends.tolist()))
                 blocks += zip(states, each, strict=True)
         for own, denominator in blocks:
-            known, basis = np.flatnonzero(fixed[own]), section_basis(denominator, own.stop - own.start)
-            directions = np.zeros((layout.size, own.stop - own.start - known.size))
-            directions[own] = basis @ null_space(basis[known]) if known.size else basis
+            given, basis = np.flatnonzero(fixed[own]), section_basis(denominator, own.stop - own.start)
+            directions = np.zeros((layout.size, own.stop - own.start - given.size))
+            directions[own] = basis @ null_space(basis[given]) if given.size else basis
             columns.append(directions)
             fixed[own] = True
-    return np.column_stack((*columns, np.eye(layout.size)[:, ~fixed]))
+    found = np.column_stack((*columns, np.eye(layout.size)[:, ~fixed]))
+    found[known] = 0.0  # without rounding errors
+    return found

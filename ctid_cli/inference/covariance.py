@@ -14,7 +14,7 @@ from ctid_cli.text import listed
 #: Beyond this condition number the inverse has no correct digit and is replaced by NaN.
 LARGEST_CONDITION = 1e14
 #: Significance level of a changing variance of the innovations.
-CHANGING = 0.05
+CHANGING = 0.01
 #: Fewest samples for each parameter in the test of a changing variance.
 SAMPLES_PER_PARAMETER = 5
 #: Largest number of harmonics of a rounding error.
@@ -136,7 +136,8 @@ def robust_dispersion(
     (:func:`_changing`), and the error of a coarsely rounded output is added (:func:`_of_rounding`).
     """
     size, count = psi[0].shape[1], sum(block.size for block in residuals)
-    found = unit_inverse(sum((block.T @ block for block in psi), np.zeros((size, size)))) if count > size else None
+    hessian = sum((block.T @ block for block in psi), np.zeros((size, size)))
+    found = unit_inverse(hessian) if 0 < size < count else None
     if found is None:
         return undefined(size)
     inverse, scale = found
@@ -151,7 +152,8 @@ def robust_dispersion(
         return np.asarray(np.sum([noise.covariance_of(block) for block in rows], axis=0))
 
     middle = covariance(noise)
-    along = [(covariance(high) - covariance(low)) / (2 * STEP) for low, high in noise.displaced]
+    with np.errstate(invalid="ignore"):  # near a unit root
+        along = [(covariance(high) - covariance(low)) / (2 * STEP) for low, high in noise.displaced]
     changing = _changing(rows, errors, noise)
     if changing is None:
         variation = [*along, middle * np.sqrt(2.0 / noise.freedom)]

@@ -146,11 +146,13 @@ class Uncertainty:
         """Return Student's degrees of freedom of quantities from derivatives by the free directions, shape (N,)."""
         if not self.variation.size:
             return np.full(len(own), np.inf)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        # Near a unit root changes may be as large as numbers can be.
+        with np.errstate(all="ignore"):
             variances = np.einsum("ni,ij,nj->n", own, self.free_covariance, own)
-            changes = np.einsum("ni,kij,nj->kn", own, self.variation, own, optimize=True)
-            found = 2.0 * variances**2 / np.sum(changes**2, axis=0)
-        return np.asarray(np.maximum(np.nan_to_num(found, nan=np.inf), LEAST_FREEDOM))
+            changes = np.einsum("ni,kij,nj->kn", own, self.variation, own, optimize=True) / variances
+            found = 2.0 / np.sum(changes**2, axis=0)
+        found[np.isnan(found)] = LEAST_FREEDOM
+        return np.asarray(np.where(variances > 0.0, np.maximum(found, LEAST_FREEDOM), np.inf))
 
     @property
     def degrees_of_freedom(self) -> float:

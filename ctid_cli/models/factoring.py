@@ -93,6 +93,33 @@ def pole_jacobian(denominator: ArrayLike, poles: ArrayLike) -> ComplexArray:
     return jacobian
 
 
+def section_slopes(denominator: ArrayLike) -> Array:
+    """Return derivatives of ``a_1 ... a_n`` by the logarithms of the coefficients of sections, shape (n, n).
+
+    A section is that of a complex pair, of two neighbouring real poles, so that these may meet, or of one real pole.
+    """
+    roots = sorted_roots(np.asarray(denominator, dtype=float))
+    sections = [np.array([1.0, -2.0 * pole.real, abs(pole) ** 2]) for pole in roots[roots.imag > 0]]
+    real = np.sort(-roots[roots.imag == 0].real)
+    # Of an odd number the one that leaves the closest pairs is alone.
+    alone = range(0, real.size, 2) if real.size % 2 else ()
+    if alone:
+        distances = [float(np.sum(np.diff(np.log(np.abs(np.delete(real, k))))[::2])) for k in alone]
+        single = alone[int(np.argmin(distances))]
+        sections.append(np.array([1.0, real[single]]))
+        real = np.delete(real, single)
+    sections += [np.array([1.0, low + high, low * high]) for low, high in zip(real[::2], real[1::2], strict=True)]
+    columns, n = list[Array](), roots.size
+    for i, section in enumerate(sections):
+        others = np.ones(1)
+        for other in sections[:i] + sections[i + 1 :]:
+            others = np.convolve(others, other)
+        for k in range(1, section.size):
+            column = section[k] * others
+            columns.append(np.pad(column, (n - (section.size - 1 - k) - column.size, section.size - 1 - k)))
+    return np.column_stack(columns) if columns else np.zeros((0, 0))
+
+
 def section_basis(denominator: ArrayLike, size: int) -> Array:
     """Return polynomials of degrees 0 to ``size - 1`` as columns of descending coefficients, shape (size, size).
 
