@@ -25,8 +25,8 @@ def derived_parameters(
     r"""Return poles, time constants, frequencies, damping and gain of a model or of submodels, by the delta method.
 
     The parameters are the leading ones of ``law``, and ``var g = (dg/dtheta) C (dg/dtheta)'`` with analytic
-    derivatives, those of the poles from :func:`pole_jacobian`, and ``g +- z se``. The linearisation only holds where a
-    pole moves little compared with its distance to the others. A pole whose ``z`` standard errors, ``sqrt(var Re p +
+    derivatives, those of the poles from :func:`pole_jacobian`, and ``g +- z se``; in logarithms for real poles, time
+    constants, natural frequencies and damping of stable models. The linearisation only holds where a pole moves little compared with its distance to the others. A pole whose ``z`` standard errors, ``sqrt(var Re p +
     var Im p)``, reach another pole is called undetermined: its accuracy is NaN and the reason is given. Natural
     frequency and damping of a pair only need it to be far from the *other* poles: they are regular where the pair meets
     on the real axis. If parameters were ``held``, quantities that are constant along the free directions have no
@@ -39,9 +39,10 @@ def derived_parameters(
     first, additive = 0, isinstance(model, AdditiveModel)
     # The numerator of a fraction may have leading coefficients that are estimated and zero.
     for number, part in enumerate(parts_of(model, len(law.tangent) - model.order - 1), 1):
-        rows = _Rows(law, level, held, first, f"g{number}_" if additive else "")
         a, last = part.denominator, float(part.denominator[-1])
         poles, jacobian = part.pole_slopes()
+        stable = bool((poles.real <= 0.0).all())
+        rows = _Rows(law, level, held, first, f"g{number}_" if additive else "", stable)
         rows.add_poles(poles, jacobian, number_lone=not additive)
         if additive and poles.size == 2 and a[0] > 0 and not poles.imag.any():
             # Two real poles, also close ones: natural frequency a_2^(-1/2) and damping a_1 a_2^(-1/2) / 2.
@@ -71,10 +72,17 @@ class _Rows:
     #: Index of the first parameter of the gradients, and prefix of the names of the quantities.
     first: int = 0
     prefix: str = ""
+    #: Whether all poles but integrators are stable.
+    stable: bool = True
     found: list[UncertainValue] = field(default_factory=list)
 
-    def add(self, name: str, estimate: float, gradient: Array, unit: str, reason: str = "") -> None:
-        """Add one quantity, from its gradient; with a reason, it has no standard error."""
+    def add(
+        self, name: str, estimate: float, gradient: Array, unit: str, reason: str = "", *, signed: bool = True
+    ) -> None:
+        """Add one quantity, from its gradient; with a reason, it has no standard error.
+
+        Unless it is ``signed``, its sign is known for stable models, and its interval is that of its logarithm.
+        """
         gradient = np.concatenate((np.zeros(self.first), gradient))
         if self.held and not reason:
             moved = np.abs(self.law.along(gradient)).max(initial=0.0)
@@ -83,16 +91,17 @@ class _Rows:
         if not reason and not np.isfinite(error):
             reason = "The covariance of the coefficients is not defined."
         reach = self.law.quantile(gradient, self.level) if np.isfinite(error) else NAN
-        self.found.append(UncertainValue.symmetric(self.prefix + name, estimate, error, unit, reach, reason))
+        found = UncertainValue.symmetric(self.prefix + name, estimate, error, unit, reach, reason)
+        self.found.append(found if signed or not estimate or not np.isfinite(error) else found.in_logarithm)
 
     def add_mode(
         self, label: str, frequency: float, radial: Array, damping: float, turning: Array, reason: str = ""
     ) -> None:
         """Add natural frequency, in rad/s and Hz, and damping of two poles."""
         hertz = frequency / (2 * np.pi), radial / (2 * np.pi)
-        self.add(f"natural_frequency{label}", frequency, radial, "rad/s", reason)
-        self.add(f"natural_frequency{label}_hz", *hertz, "Hz", reason)
-        self.add(f"damping{label}", damping, turning, "-", reason)
+        self.add(f"natural_frequency{label}", frequency, radial, "rad/s", reason, signed=False)
+        self.add(f"natural_frequency{label}_hz", *hertz, "Hz", reason, signed=False)
+        self.add(f"damping{label}", damping, turning, "-", reason, signed=not self.stable)
 
     def add_poles(self, poles: ComplexArray, jacobian: ComplexArray, *, number_lone: bool = True) -> None:
         """Add poles, time constants, natural frequencies and damping."""
@@ -104,12 +113,14 @@ class _Rows:
             others = np.arange(poles.size) != k
             reason = self._undetermined(poles, k, slope, others)
             if pole.imag == 0:
-                self.add(f"pole{label}", x, slope.real, "rad/s", reason)
+                self.add(f"pole{label}", x, slope.real, "rad/s", reason, signed=not self.stable)
                 if x == 0:
                     reason = "The pole lies at the origin: it integrates and has no time constant."
                     self.add(f"time_constant{label}", float("inf"), slope.real, "s", reason)
                 else:
-                    self.add(f"time_constant{label}", -1.0 / x, slope.real / x**2, "s", reason)
+                    self.add(
+                        *(f"time_constant{label}", -1.0 / x, slope.real / x**2, "s", reason), signed=not self.stable
+                    )
                 continue
             frequency = abs(complex(pole))
             self.add(f"pole{label}_real", x, slope.real, "rad/s", reason)
@@ -130,13 +141,18 @@ class _Rows:
 def indistinct(
     poles: ComplexArray, k: int, slope: ComplexArray, others: BoolArray, law: Uncertainty, level: float
 ) -> bool:
-    """Return whether the interval of pole k, with the given derivatives, reaches another pole."""
+    """Return whether the interval of pole k, with the given derivatives, reaches another pole.
+
+    Distances of real stable poles, and their intervals, are those of logarithms.
+    """
     if not others.any():
         return False
     distance = float(np.abs(poles[others] - poles[k]).min())
     if distance <= 1e-7 * float(np.abs(poles).max()) or not np.isfinite(slope).all():
         return True
     spread = math.hypot(law.error(slope.real), law.error(slope.imag))
+    if not poles.imag.any() and (poles.real < 0.0).all():
+        distance = float(np.abs(np.log(poles[others].real / poles[k].real)).min()) * abs(float(poles[k].real))
     return law.quantile(slope.real, level) * spread >= distance
 
 

@@ -81,6 +81,14 @@ class UncertainValue:
         return cls(name, estimate, standard_error, estimate - reach, estimate + reach, unit, reason=reason)
 
     @property
+    def in_logarithm(self) -> UncertainValue:
+        """The estimate with an interval of the same probability for the logarithm of its size, so of one sign."""
+        with np.errstate(all="ignore"):
+            factor = float(np.exp((self.high - self.estimate) / np.abs(np.float64(self.estimate))))
+        low, high = sorted((self.estimate / factor, self.estimate * factor))
+        return replace(self, low=low, high=high)
+
+    @property
     def shown(self) -> float:
         """The estimate; NaN if it is not determined, and therefore no result."""
         return math.nan if self.is_undetermined else self.estimate
