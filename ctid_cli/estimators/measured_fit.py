@@ -25,7 +25,7 @@ from ctid_cli.filtering.bank import Equations
 from ctid_cli.inference.covariance import Rounding, condition_number
 from ctid_cli.inference.criteria import percent_from_r_squared
 from ctid_cli.inference.fit import DeferredFields, Fit, InputFit, Status
-from ctid_cli.inference.innovations import NoiseFit
+from ctid_cli.inference.innovations import NoiseFit, restricted_dispersion, steps_of
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_covariance, orders_of
 from ctid_cli.inference.repetition import Equivalent
@@ -206,6 +206,10 @@ class MeasuredFit(DeferredFields, Fit):
                 tangent=self.tangent,
                 rounding=() if self.noise or self.weighting else self.rounding,
             )
+        if self.noise is not None and found.kind == "white" and found.defined:
+            psi, steps = [block @ self.tangent for block in self.sensitivities], [*map(steps_of, self.used)]
+            restricted = restricted_dispersion(self.noise.noise, psi, self.residuals, steps)
+            found = Uncertainty.of("white", self.tangent, restricted)
         return found.in_ignored_loop if self.in_ignored_loop and kind == "auto" else found
 
     def _with_uncertainty(self, kind: Covariance, draws: int) -> Self:

@@ -25,9 +25,10 @@ def derived_parameters(
     r"""Return poles, time constants, frequencies, damping and gain of a model or of submodels, by the delta method.
 
     The parameters are the leading ones of ``law``, and ``var g = (dg/dtheta) C (dg/dtheta)'`` with analytic
-    derivatives, those of the poles from :func:`pole_jacobian`, and ``g +- z se``; in logarithms for real poles, time
-    constants, natural frequencies and damping of stable models. The linearisation only holds where a pole moves little compared with its distance to the others. A pole whose ``z`` standard errors, ``sqrt(var Re p +
-    var Im p)``, reach another pole is called undetermined: its accuracy is NaN and the reason is given. Natural
+    derivatives, those of the poles from :func:`pole_jacobian`, and ``g +- z se``; for real poles, time constants,
+    natural frequencies and damping of stable models the interval is that of the logarithm. The linearisation only holds
+    where a pole moves little compared with its distance to the others. A pole whose ``z`` standard errors, ``sqrt(var
+    Re p + var Im p)``, reach another pole is called undetermined: its accuracy is NaN and the reason is given. Natural
     frequency and damping of a pair only need it to be far from the *other* poles: they are regular where the pair meets
     on the real axis. If parameters were ``held``, quantities that are constant along the free directions have no
     standard error.

@@ -14,7 +14,7 @@ References
    autoregressive-moving average disturbances", *Biometrika* 66 (1979) 49-58. doi:10.1093/biomet/66.1.49
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IntArray
+from ctid_cli.inference.covariance import Dispersion
 from ctid_cli.inference.noise_model import levinson
 from ctid_cli.signals.noise import ArmaNoise
 
@@ -37,6 +38,8 @@ LONG_LAGS, SAMPLES_PER_LAG = 10, 10
 EXACT, ROUGH, EVALUATIONS = 1e-12, 1e-6, 40
 #: Step of central differences by the transformed partial correlations.
 DIFFERENCE = 1e-5
+#: Step of second differences by them.
+SECOND_DIFFERENCE = 1e-2
 
 
 class Whitener:
@@ -162,6 +165,66 @@ def fit_arma(
         starts.append(_transformed(*_hannan_rissanen(errors, orders)))
     likelihood = _Likelihood(errors, steps, orders)
     return min((likelihood.found(start, tolerance) for start in starts), key=lambda fit: fit.deviance)
+
+
+def restricted_dispersion(
+    noise: ArmaNoise, psi: Sequence[Array], errors: Sequence[Array], steps: Sequence[IntArray]
+) -> Dispersion:
+    r"""Return the covariance of an estimate by generalised least squares, for the noise of the restricted likelihood.
+
+    The maximum-likelihood noise is that of errors from which the estimate has taken a part, mostly at low frequencies.
+    With the whitened sensitivities, in the notation of the module,
+
+    .. math:: \min\; (N - p) \ln s^2 + \ln|V| + \ln|\Psi'V^{-1}\Psi|, \qquad C = s^2 (\Psi'V^{-1}\Psi)^{-1},
+
+    and the uncertainty of C follows from the second derivatives of this criterion.
+    """
+    from scipy.optimize import minimize  # slow to import
+
+    orders = len(noise.denominator) - 1, len(noise.numerator) - 1
+    likelihood, size = _Likelihood(errors, steps, orders), psi[0].shape[1]
+    spare = likelihood.count - size
+    scale = 1.0 / np.linalg.norm(np.concatenate(psi), axis=0)
+    rows = [np.vstack(((block * scale).T, e)) for block, e in zip(psi, errors, strict=True)]
+
+    def at(z: Array) -> tuple[float, Array]:
+        """Return the criterion, and the triangle of sensitivities and errors."""
+        whitened, logarithm, model = [], 0.0, likelihood.noise(z)
+        for block, own in zip(rows, steps, strict=True):
+            whitener = Whitener(model, size + 1)
+            whitened.append(whitener(block.copy(), own).T)
+            logarithm += whitener.logarithm
+        triangle = np.asarray(np.linalg.qr(np.concatenate(whitened), mode="r"))
+        lengths = np.maximum(np.abs(np.diag(triangle)), np.finfo(float).tiny)
+        return float(logarithm + 2.0 * np.log(lengths[:size]).sum() + 2.0 * spare * np.log(lengths[size])), triangle
+
+    def covariance(z: Array) -> Array:
+        triangle = at(z)[1]
+        inverse = np.linalg.inv(triangle[:size, :size])
+        return np.asarray(inverse @ inverse.T * triangle[size, size] ** 2 / spare * np.outer(scale, scale))
+
+    start = np.clip(_transformed(np.array(noise.denominator), np.array(noise.numerator)), -FARTHEST, FARTHEST)
+    z = minimize(lambda z: at(z)[0], start, bounds=[(-FARTHEST, FARTHEST)] * start.size, method="L-BFGS-B").x
+    middle = covariance(z)
+    values, vectors = np.linalg.eigh(_curvature(lambda z: at(z)[0], z))
+    along = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        step = 0.01 * vector / np.sqrt(0.5 * max(value, 1.0))
+        along.append((covariance(z + step) - covariance(z - step)) / 0.02)
+    return Dispersion(middle, np.array([middle * np.sqrt(2.0 / spare), *along]))
+
+
+def _curvature(function: Callable[[Array], float], x: Array) -> Array:
+    """Return second derivatives by differences."""
+    steps, here = SECOND_DIFFERENCE * np.eye(x.size), function(x)
+    ends = [[function(x + sign * step) for step in steps] for sign in (1.0, -1.0)]
+    found = np.zeros((x.size, x.size))
+    for i, one in enumerate(steps):
+        found[i, i] = ends[0][i] + ends[1][i] - 2.0 * here
+        for j, other in enumerate(steps[:i]):
+            both = function(x + one + other) + function(x - one - other)
+            found[i, j] = found[j, i] = 0.5 * (both - ends[0][i] - ends[1][i] - ends[0][j] - ends[1][j] + 2.0 * here)
+    return found / SECOND_DIFFERENCE**2
 
 
 def all_arma(
