@@ -236,9 +236,10 @@ class Identification(DeferredFields, FittedModel, Shown):
             text = f"Standard errors are those for white {what}"
             text += f", as the {what} pass the test" * bool(self.tests and passed)
         else:
-            noise = "coloured noise" + " of changing variance" * found.changing
             why = "" if passed else f", because the {what} are not white"
-            text = f"Standard errors are those for {noise}{why}{', and for the rounded output' * found.rounded}"
+            noise = ["coloured noise" + why] * found.coloured + ["noise of changing variance"] * found.changing
+            noise += ["the rounding of the output"] * found.rounded
+            text = f"Standard errors allow for {listed(noise or ['coloured noise' + why])}"
         if found.bootstrap is None:
             reach, freedom = found.quantiles(), found.freedom(found.tangent[found.tangent.any(axis=1)])
             text += f"; intervals are estimate -+ {_span(reach[np.isfinite(reach)], 3)} of them"

@@ -296,7 +296,7 @@ class MultiInputFit(MeasuredFit):
         As in :class:`MeasuredFit`; ``input_offsets`` has those of all inputs, record by record.
     poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met, equivalents, undetermined
         As in :class:`MeasuredFit`.
-    intervals, other_minima
+    intervals, other_minima, rounding
         As in :class:`MeasuredFit`.
     """
 

@@ -8,13 +8,14 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.loop_noise import SensitivityFunction
-from ctid_cli.inference.noise_model import STEP, NoiseModel, fit_residual_noise
+from ctid_cli.inference.noise_model import STEP, NoiseModel, fit_residual_noise, row_blocks
 from ctid_cli.text import listed
 
 #: Beyond this condition number the inverse has no correct digit and is replaced by NaN.
 LARGEST_CONDITION = 1e14
-#: Significance level of a changing variance of the innovations.
-CHANGING = 0.01
+#: Significance level at which a changing variance of the innovations is allowed for. Measured, 200 samples, deviation
+#: proportional to the output: coverage of the gain 90, 93 and 96 % at .01, .05 and 1.
+CHANGING = 0.05
 #: Fewest samples for each parameter in the test of a changing variance.
 SAMPLES_PER_PARAMETER = 5
 #: Largest number of harmonics of a rounding error.
@@ -50,9 +51,8 @@ class Dispersion(NamedTuple):
     #: W, shape (k, p, p); empty if C is known.
     variation: Array
     noise: NoiseModel | None = None
-    #: Whether the variance of the innovations changes.
+    #: Whether it allows for a changing variance, and for the error of rounding the output.
     changing: bool = False
-    #: Whether the error of rounding the output exceeds the noise.
     rounded: bool = False
 
     @classmethod
@@ -171,13 +171,15 @@ def _changing(rows: Sequence[Array], errors: Sequence[Array], noise: NoiseModel)
 
     The estimate is ``sum_t a_t v_t = sum_s g_s e_s`` with the innovations e and the rows g of
     :meth:`NoiseModel.weights_of`. Koenker's test regresses ``e^2`` on the squares of the columns of g [1]_: other
-    changes of the variance do not matter. Squared innovations over their expectation (HC2) then replace their
-    variance; those of a normal variable have the variance 2/3 of their square.
+    changes of the variance do not matter. Squared innovations of the estimate without each sample (HC3 [2]_) then
+    replace their variance; those of a normal variable have the variance 2/3 of their square.
 
     References
     ----------
     .. [1] R. Koenker, "A note on studentizing a test for heteroscedasticity", *Journal of Econometrics* 17 (1981)
        107-112. doi:10.1016/0304-4076(81)90062-2
+    .. [2] J. G. MacKinnon and H. White, "Some heteroskedasticity-consistent covariance matrix estimators with improved
+       finite sample properties", *Journal of Econometrics* 29 (1985) 305-325. doi:10.1016/0304-4076(85)90158-7
     """
     from scipy.special import chdtrc  # slow to import
 
@@ -194,10 +196,13 @@ def _changing(rows: Sequence[Array], errors: Sequence[Array], noise: NoiseModel)
     if not (spread > 0.0 and rank > 1 and chdtrc(rank - 1, squares.size * explained / spread) < CHANGING):
         return None
     orthonormal = np.linalg.qr(g)[0]
-    expected = squares / np.maximum(1.0 - np.sum(orthonormal**2, axis=1), 0.1)
+    expected = squares / np.maximum(1.0 - np.sum(orthonormal**2, axis=1), 0.1) ** 2
     i, j = np.triu_indices(size)
-    products = g[:, i] * g[:, j] * expected[:, None]
-    values, vectors = np.linalg.eigh(2.0 / 3.0 * products.T @ products)
+    products = np.zeros((i.size, i.size))
+    for block in row_blocks(len(g)):
+        own = g[block][:, i] * g[block][:, j] * expected[block, None]
+        products += own.T @ own
+    values, vectors = np.linalg.eigh(2.0 / 3.0 * products)
     variation = []
     for value, vector in zip(values, vectors.T, strict=True):
         if value > 1e-8 * values[-1]:

@@ -204,7 +204,8 @@ def restricted_dispersion(
         return np.asarray(inverse @ inverse.T * triangle[size, size] ** 2 / spare * np.outer(scale, scale))
 
     start = np.clip(_transformed(np.array(noise.denominator), np.array(noise.numerator)), -FARTHEST, FARTHEST)
-    z = minimize(lambda z: at(z)[0], start, bounds=[(-FARTHEST, FARTHEST)] * start.size, method="L-BFGS-B").x
+    limits = [(-FARTHEST, FARTHEST)] * start.size
+    z = minimize(lambda z: at(z)[0], start, bounds=limits, method="L-BFGS-B").x if limits else start
     middle = covariance(z)
     values, vectors = np.linalg.eigh(_curvature(lambda z: at(z)[0], z))
     along = []

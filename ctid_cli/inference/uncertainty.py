@@ -14,6 +14,7 @@ from ctid_cli.inference.innovations import SampledNoise
 from ctid_cli.inference.intervals import student_quantiles
 from ctid_cli.inference.loop_noise import SensitivityFunction
 from ctid_cli.inference.noise_model import NoiseModel
+from ctid_cli.inference.residual_tests import all_white
 from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.progress import report, reported
 from ctid_cli.signals.noise import ArmaNoise
@@ -98,14 +99,25 @@ class Uncertainty:
     #: Changes of that covariance by one standard deviation of the parameters of the noise, shape (k, f, f).
     variation: Array = field(repr=False, default_factory=lambda: np.zeros((0, 0, 0)))
     bootstrap: BootstrapT | None = None
-    #: Whether the variance of the noise changes, and whether rounding of the output matters.
+    #: Whether the errors allow for coloured noise, for a changing variance, and for the rounding of the output.
+    coloured: bool = False
     changing: bool = False
     rounded: bool = False
+    #: Whether the residuals pass as white.
+    passed: bool = True
 
     @classmethod
     def of(cls, kind: Formula, tangent: Array, found: Dispersion) -> "Uncertainty":
         """Return the distribution for a covariance along the tangent."""
-        return cls(kind, tangent, found.covariance, found.variation, changing=found.changing, rounded=found.rounded)
+        return cls(
+            kind,
+            tangent,
+            found.covariance,
+            found.variation,
+            coloured=found.noise is not None and found.noise.order > 0,
+            changing=found.changing,
+            rounded=found.rounded,
+        )
 
     @classmethod
     def known(cls, covariance: Array) -> "Uncertainty":
@@ -191,7 +203,7 @@ class Uncertainty:
     @property
     def in_ignored_loop(self) -> "Uncertainty":
         """Uncertainty if the fit ignores the loop of its record: undefined, unless the residuals are white."""
-        if self.kind == "white" or not self.defined:
+        if self.passed or not self.defined:
             return self
         return replace(self.undefined, kind="biased", bootstrap=None)
 
@@ -225,8 +237,10 @@ def estimate_uncertainty(
         found = white_noise_dispersion(hessian, sum(float(e @ e) for e in residuals), count)
         return Uncertainty.of("white", basis, found)
     found = robust_dispersion(free, residuals, loop, rounding)
-    white = found.noise is None or not (found.noise.order or found.changing or found.rounded)
-    law = Uncertainty.of("white" if kind == "auto" and white else "robust", basis, found)
+    law = Uncertainty.of("robust", basis, found)
+    if kind == "auto":
+        white = not (law.coloured or law.changing or law.rounded)
+        return replace(law, kind="white" if white else "robust", passed=all_white(residuals))
     if kind == "bootstrap" and law.defined and found.noise is not None:
         return replace(law, kind="bootstrap", bootstrap=bootstrap_t(free, found.noise, draws, loop=loop))
     return law

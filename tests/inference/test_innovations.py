@@ -12,6 +12,7 @@ from ctid_cli.inference.innovations import (
     all_arma,
     coefficient_slopes,
     fit_arma,
+    restricted_dispersion,
     sampled,
     steps_of,
 )
@@ -91,6 +92,37 @@ def test_slopes_by_the_coefficients_are_differences():
     for k, h in enumerate(1e-6 * np.eye(3)):
         at = np.array([-1.0, 0.2, 0.9])
         np.testing.assert_allclose(slopes[:, k], (scaled(*at + h) - scaled(*at - h)) / 2e-6, atol=1e-5)
+
+
+def test_restricted_covariance_is_that_of_dense_matrices():
+    """AR(1): the least criterion over a fine grid of the coefficient."""
+    rng = np.random.default_rng(6)
+    psi = np.column_stack((np.ones(60), np.cumsum(rng.standard_normal(60))))
+    v = drawn(ArmaNoise((1.0,), (1.0, -0.8), innovation_variance=1.0), 60)
+    fit = fit_arma([v], [steps_of(np.ones(60, dtype=bool))], (1, 0))
+    found = restricted_dispersion(fit.noise, [psi], [v], [steps_of(np.ones(60, dtype=bool))])
+
+    def dense(pole):
+        inverse = np.linalg.inv(toeplitz(pole ** np.arange(60)) / (1.0 - pole**2))
+        gram = psi.T @ inverse @ psi
+        rest = v - psi @ np.linalg.solve(gram, psi.T @ inverse @ v)
+        square = float(rest @ inverse @ rest)
+        criterion = 58 * np.log(square) - np.linalg.slogdet(inverse)[1] + np.linalg.slogdet(gram)[1]
+        return criterion, square / 58 * np.linalg.inv(gram)
+
+    poles = np.linspace(0.3, 0.99, 2000)
+    best = min((dense(pole) for pole in poles), key=lambda each: each[0])[1]
+    np.testing.assert_allclose(found.covariance, best, rtol=0.01)
+    criteria = np.array([dense(pole)[0] for pole in poles])
+    # Along z = artanh(pole), two standard deviations raise the criterion by about 4.
+    z, least = np.arctanh(poles), criteria.argmin()
+    inside = (criteria < criteria[least] + 0.01) & (np.abs(z - z[least]) < 0.2)
+    deviation = (z[inside][-1] - z[inside][0]) / 2 / 0.1
+    (slope,) = np.gradient([np.log(dense(pole)[1][0, 0]) for pole in np.tanh(z[least] + np.array([-0.01, 0, 0.01]))])[
+        1:2
+    ]
+    change = found.variation[1][0, 0] / found.covariance[0, 0]
+    assert abs(change) == pytest.approx(deviation * slope / 0.01, rel=0.05)
 
 
 def test_two_records_share_one_noise():
