@@ -11,19 +11,21 @@ amplitude is at least six of its standard errors, and any other tone at least th
 that could be right count, found or not; with one tone too few, only wrong rows count.
 
 Then: named cases, in which no valid row may be off by more than .02 Hz or 3.3 of its standard errors, whichever is
-larger; and coverage of the standard errors and their size relative to the bound, for one to three steady tones in white
-and coloured noise.
+larger; and one to three clean tones in white and coloured noise: coverage of the rows in the middle and their errors
+relative to the bound, and for frequencies and amplitudes of the printed table the median standard error relative to the
+scatter (target 1/1.2 to 1.2), and coverage.
 """
 
 import argparse
 import time
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
 
 from ctid_cli.errors import DataError
 from ctid_cli.tones.constants import USUAL_ACCURACY
+from ctid_cli.tones.summary import summarise
 from ctid_cli.tones.track import Track, track
 
 ROWS = 60
@@ -243,28 +245,39 @@ NAMED = (
 )
 
 
+#: Frequencies of clean tones [rad/sample]; the last two are four bins apart.
+SIZE = 2000
+CLEAN = {"1": (0.6,), "2": (0.6, 1.1), "3": (0.6, 1.1, 1.9), "2 near": (0.6, 0.6 + 8.0 * np.pi / SIZE)}
+
+
 def efficiency(records: int, seed: int) -> None:
-    """Print the table of efficiency: steady tones, N = 2000, 20 dB, errors in the middle of the record."""
-    print(f"\n{'tones':5} {'noise':8} {'covered':>8} {'rmse / bound':>12}")
-    size, omega = 2000, np.array([0.6, 1.1, 1.9])
-    for pole in (0.0, 0.9):
-        for tones in (1, 2, 3):
-            off: list[Any] = []
+    """Print the table of clean tones."""
+    print(f"\n{'':18}{'middle row':>21}{'frequencies':>23}{'amplitudes':>23}")
+    print(f"{'tones':6} {'noise':10} {'covered':>8} {'rmse / bound':>12}" + f" {'error / scatter':>15} covered" * 2)
+    for noise, pole, deviation in (("white", 0.0, 0.0707), ("white 40 dB", 0.0, 0.00707), ("AR .9", 0.9, 0.0707)):
+        for name, tones in CLEAN.items():
+            omega, rows = np.array(tones), []
+            gain = np.abs(1.0 - pole * np.exp(-1j * omega)) ** 2
+            bound = np.sqrt(24.0 * deviation**2 * (1.0 - pole**2) / gain / SIZE**3)
             for k in range(records):
                 rng = np.random.default_rng([seed, 7, k])
-                raw = lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], rng.standard_normal(size + 200))[200:]
-                phase = rng.uniform(0.0, 2.0 * np.pi, 3)
-                y = sum(np.cos(omega[j] * np.arange(size) + phase[j]) for j in range(tones)) + 0.0707 * raw
-                found = track(Recorded(y, 1.0), tones, every=size / 2.0)
-                if not np.isfinite(found.omega[1]).all():
-                    continue
-                density = 0.0707**2 * (1.0 - pole**2) / np.abs(1.0 - pole * np.exp(-1j * omega[:tones])) ** 2
-                bound = np.sqrt(24.0 * density / size**3)
-                error = found.omega[1] - omega[:tones]
-                off += list(zip(np.abs(error) < 1.96 * found.error[1], error / bound, strict=True))
-            inside, ratio = np.array(off).T
-            name = "AR .9" if pole else "white"
-            print(f"{tones:5} {name:8} {100 * inside.mean():7.1f}% {np.sqrt(np.mean(ratio**2)):12.3f}", flush=True)
+                raw = lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], rng.standard_normal(SIZE + 200))[200:]
+                phase = rng.uniform(0.0, 2.0 * np.pi, 3)[: omega.size]
+                y = np.cos(np.outer(np.arange(SIZE), omega) + phase).sum(axis=1) + deviation * raw
+                found = track(Recorded(y, 1.0), omega.size, every=SIZE / 20.0)
+                if np.isfinite(found.omega[10]).all():
+                    table = [
+                        (2.0 * np.pi * each.standard_error_hz, each.omega, each.amplitude_error, each.amplitude)
+                        for each in summarise(found)
+                    ]
+                    rows.append([found.error[10], found.omega[10], *np.transpose(table)])
+            errors, values = np.array(rows)[:, ::2], np.array(rows)[:, 1::2]
+            off = values - np.stack((omega, omega, np.ones_like(omega)))
+            covered = 100.0 * (np.abs(off) < 1.96 * errors).mean(axis=(0, 2))
+            ratio = 1.0 / np.sqrt(np.mean((off / np.median(errors, axis=0)) ** 2, axis=(0, 2)))
+            rmse = np.sqrt(np.mean((off[:, 0] / bound) ** 2))
+            cells = "".join(f" {ratio[k]:15.3f} {covered[k]:6.1f}%" for k in (1, 2))
+            print(f"{name:6} {noise:11} {covered[0]:6.1f}% {rmse:12.3f}{cells}", flush=True)
 
 
 def main() -> None:

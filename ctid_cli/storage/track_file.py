@@ -14,7 +14,7 @@ from ctid_cli.signals.sampled_signal import SampledSignal, read_sampled_signal
 from ctid_cli.storage.result_file import ResultKind, Source, decoded, encoded, path_and_sum, require, texts
 from ctid_cli.tones.track import Track
 
-TRACK = ResultKind("ctid track", 2, "track", "ctid track", "track again")
+TRACK = ResultKind("ctid track", 3, "track", "ctid track", "track again", oldest=3)
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.tones.track import Track
+
+#: Places in the shortest window at which the weights of samples are computed; of a window alone any number is exact.
+PLACES = 16
 
 
 @dataclass(frozen=True)
@@ -48,11 +52,11 @@ def _tone(track: Track, k: int) -> ToneSummary:
     return ToneSummary(
         tone=k + 1,
         frequency_hz=_median(omega) / turn,
-        standard_error_hz=_error_of_mean(track, used, track.error[:, k], k) / turn,
+        standard_error_hz=_error_of_mean(track, used, track.error[:, k], k, [1, 2]) / turn,
         spread_hz=float(high / turn - low / turn) / 2.0,
         omega=_median(omega),
         amplitude=_median(amplitudes),
-        amplitude_error=_error_of_mean(track, used, track.amplitude_error[:, k], k),
+        amplitude_error=_error_of_mean(track, used, track.amplitude_error[:, k], k, [0, 1]),
         begins=float(seen[0]) if seen.size else math.nan,
         ends=float(seen[-1]) if seen.size else math.nan,
         valid_percent=100.0 * float(valid.sum() / there.sum()) if there.any() else 0.0,
@@ -63,15 +67,30 @@ def _median(values: Array) -> float:
     return float(np.median(values)) if values.size else math.nan
 
 
-def _error_of_mean(track: Track, used: BoolArray, errors: Array, k: int) -> float:
-    """Return the standard error of the mean over rows of a tone; overlapping windows have common errors.
+def _error_of_mean(track: Track, used: BoolArray, errors: Array, k: int, orders: list[int]) -> float:
+    """Return the standard error of the mean over rows of a tone; rows with common samples have common errors.
 
-    Windows of length L, every D seconds, are equivalent to a share D/L of independent rows: the mean of N rows has the
-    variance ``sum_i s_i^2 min(L_i/D, N)/N^2``.
+    The rows of a window lie on a line. The errors of its middle and of its slope are independent sums over the noise of
+    the samples, weighted by the Legendre polynomials of ``orders``: P1 and P2 for a frequency, the slope of a quadratic
+    phase, and P0 and P1 for an amplitude. The least error of the rows is that of the middle; the excess of any other is
+    due to the slope, and has opposite signs in both halves. The mean of all rows is one such sum.
     """
-    known = used & np.isfinite(errors) & np.isfinite(track.window[:, k])
-    n = int(known.sum())
-    if n == 0:
+    used = used & np.isfinite(errors + track.window[:, k] + track.middle[:, k])
+    if not used.any():
         return math.nan
-    common = np.clip(track.window[known, k] / track.every, 1.0, n)
-    return float(np.sqrt(np.sum(errors[known] ** 2 * common))) / n
+    error, both = errors[used], np.column_stack((track.middle[used, k], track.window[used, k]))
+    windows, of = np.unique(both, axis=0, return_inverse=True)
+    of = of.ravel()
+    least = np.full(len(windows), np.inf)
+    np.minimum.at(least, of, error)
+    excess = np.sign(track.t[used] - both[:, 0]) * np.sqrt(error**2 - least[of] ** 2)
+    sums = np.column_stack((np.bincount(of) * least, np.bincount(of, excess)))
+    middle, length = windows.T * (PLACES / windows[:, 1].min())
+    first = np.round(middle - 0.5 * length).astype(int)
+    count = np.round(length).astype(int)
+    first -= first.min()
+    weights = np.zeros((first + count).max())
+    for j, size in enumerate(count):
+        basis = legvander((2.0 * np.arange(size) + 1.0) / size - 1.0, 2)[:, orders]
+        weights[first[j] : first[j] + size] += basis / np.linalg.norm(basis, axis=0) @ sums[j]
+    return float(np.linalg.norm(weights)) / error.size

@@ -64,8 +64,8 @@ class Track:
         Logarithmic growth of the amplitude [1/s]; negative where it decays.
     rate : ndarray, shape (N, n)
         Rate of change of the frequency [rad/s^2].
-    window : ndarray, shape (N, n)
-        Length of the window from which the row is estimated [s].
+    window, middle : ndarray, shape (N, n)
+        Length of the window from which the row is estimated [s], and its middle [s since the first sample].
     flags : ndarray of uint16, shape (N, n)
         Bit fields of :class:`~ctid_cli.frequency.flags.Flag`.
     every : float
@@ -91,6 +91,7 @@ class Track:
     growth: Array
     rate: Array
     window: Array
+    middle: Array
     flags: NDArray[np.uint16]
     every: float
     missing: tuple[MissingLine, ...] = ()
@@ -131,7 +132,7 @@ class Track:
         Track
             The track.
         """
-        names = ("error", "amplitudes", "amplitude_error", "phase", "growth", "rate", "window")
+        names = ("error", "amplitudes", "amplitude_error", "phase", "growth", "rate", "window", "middle")
         parts: dict[str, Any] = {name: np.asarray(known.pop(name, np.full(omega.shape, np.nan))) for name in names}
         each = np.broadcast_to(flags if flags.ndim == 2 else flags[:, None], omega.shape).astype(np.uint16)
         return cls(t=t, omega=omega, flags=each, every=every, **parts, **known)
@@ -304,6 +305,7 @@ def _columns(found: Readings, paths: list[IndexArray], count: int, places: Array
         "growth": found.growth / thin,
         "rate": found.rate / thin**2,
         "window": found.window * thin,
+        "middle": found.middle * thin + ready.begins,
     }
     columns = {name: np.full((places.size, count), np.nan) for name in values}
     flags = np.full((places.size, count), int(Flag.ABSENT), np.uint16)

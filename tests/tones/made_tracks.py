@@ -30,8 +30,9 @@ def coming_later():
     flags[:20, 1] = int(Flag.ABSENT)
     flags[20:25, 1] = int(Flag.UNRESOLVED)
     lines = (MissingLine(2 * np.pi * 85.0, 0.9, 0.1), MissingLine(2 * np.pi * 120.0, 0.25, 0.02))
-    track = make_track(error=np.full((ROWS, 2), 0.01), window=np.full((ROWS, 2), 0.2))
+    middle = np.repeat(0.1 * np.arange(ROWS)[:, None], 2, axis=1)
+    track = make_track(error=np.full((ROWS, 2), 0.01), window=np.full((ROWS, 2), 0.2), middle=middle)
     omega = track.omega.copy()
     omega[:20, 1] = np.nan
-    parts = {"error": track.error, "amplitudes": track.amplitudes, "window": track.window, "missing": lines}
-    return Track.of(track.t, omega, flags, 0.1, **parts)
+    parts = {name: getattr(track, name) for name in ("error", "amplitudes", "window", "middle")}
+    return Track.of(track.t, omega, flags, 0.1, **parts, missing=lines)

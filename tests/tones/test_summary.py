@@ -21,16 +21,30 @@ def test_a_summary_is_over_valid_rows():
 
 
 def test_the_error_of_the_mean_counts_common_samples_once():
-    """Full-length windows in all rows: the mean is as good as one row; disjoint windows: as sqrt(N) rows."""
-    error = np.full((ROWS, 2), 2 * np.pi * 0.01)
-    one = summarise(make_track(error=error, window=np.full((ROWS, 2), 0.1 * ROWS)))
-    assert [tone.standard_error_hz for tone in one] == pytest.approx([0.01, 0.01])
-    apart = summarise(make_track(error=error, window=np.full((ROWS, 2), 0.05)))
-    assert apart[0].standard_error_hz == pytest.approx(0.01 / np.sqrt(ROWS))
-    # Half of each window is shared with each neighbour: the variance of the mean is twice as large.
-    half = summarise(make_track(error=error, window=np.full((ROWS, 2), 0.2)))
-    assert half[1].standard_error_hz == pytest.approx(0.01 * np.sqrt(2 / ROWS))
-    assert np.isnan(summarise(make_track())[0].standard_error_hz)
+    """The mean of a window is its middle; disjoint windows are independent; half-overlapping ones are correlated.
+
+    Weights of the samples: P1 for a frequency, with products of -1/4 over half a window, and P0 for an amplitude, 1/2.
+    """
+    t = 0.1 * np.arange(ROWS)[:, None]
+    ones, centre = np.ones((ROWS, 2)), 0.5 * t[-1]
+
+    def errors(window, middle, at=ones):
+        known = {"error": 2 * np.pi * 0.01 * at, "amplitude_error": 0.02 * at}
+        one, _ = summarise(make_track(**known, window=window * ones, middle=middle * ones))
+        return one.standard_error_hz, one.amplitude_error
+
+    # In units of half the window, the variance of a frequency is 1 + 15 u^2, and the middle is not among the rows.
+    u = (t - centre) / (0.05 * ROWS)
+    steep = np.sqrt((1 + 15 * u**2) / (1 + 15 * (u**2).min())) * ones
+    assert errors(0.1 * ROWS, centre, steep) == pytest.approx([0.01, 0.02])
+    assert errors(0.05, t) == pytest.approx([0.01 / np.sqrt(ROWS), 0.02 / np.sqrt(ROWS)])
+    assert errors(0.2, t)[0] == pytest.approx(0.01 * np.sqrt(ROWS - 0.5 * (ROWS - 1)) / ROWS, rel=0.02)
+    assert errors(0.2, t)[1] == pytest.approx(0.02 * np.sqrt(ROWS + (ROWS - 1)) / ROWS)
+    # The mean of rows on one side of the middle is as uncertain as the value half-way between the first and the last.
+    u = t / (0.1 * ROWS)
+    one_side = errors(0.2 * ROWS, t[0], np.sqrt(1 + 15 * u**2) * ones)
+    assert one_side[0] == pytest.approx(0.01 * np.sqrt(1 + 15 * u.mean() ** 2))
+    assert np.isnan(summarise(make_track(error=0.01 * ones))[0].standard_error_hz)
 
 
 @pytest.mark.parametrize(("accuracy", "bad"), [(None, [0, 1]), (0.011, [0, 0]), (0.005, [1, 1])])

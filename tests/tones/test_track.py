@@ -4,15 +4,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
+from scipy.stats import chi2
 
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.flags import Flag
+from ctid_cli.tones.summary import summarise
 from ctid_cli.tones.track import track as follow_record
 
 INTERVAL = 0.001
 T = INTERVAL * np.arange(4000)
 NOISE = 0.01 * np.random.default_rng(2).standard_normal(T.size)
 HERTZ = 2.0 * np.pi
+TRUE = [0.6, 1.1, 1.9]
 
 
 def tone(hertz, amplitude=1.0, phase=0.0):
@@ -46,6 +50,24 @@ def test_a_steady_tone_is_known_as_well_as_can_be():
         pytest.approx(0.0, abs=0.02)
     )
     assert track.valid.all()
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.9])
+def test_the_errors_of_clean_tones_are_those_of_their_scatter(pole):
+    """Monte Carlo: three tones of 60 records, median standard errors; the ratio is within the 99.9 % limits of 180."""
+    off, errors = np.empty((2, 2, 60, 3))
+    rng = np.random.default_rng(12)
+    for k in range(60):
+        noise = lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], rng.standard_normal(700))[200:]
+        phase = np.outer(np.arange(500), TRUE) + rng.uniform(0.0, HERTZ, 3)
+        found = summarise(follow_tones(np.cos(phase).sum(axis=1) + 0.01 * noise, 1.0, 3, every=12.5))
+        off[:, k] = np.transpose(
+            [(tone.omega - true, tone.amplitude - 1.0) for tone, true in zip(found, TRUE, strict=True)]
+        )
+        errors[:, k] = np.transpose([(HERTZ * tone.standard_error_hz, tone.amplitude_error) for tone in found])
+    low, high = np.sqrt(chi2.ppf([0.0005, 0.9995], 180) / 180)
+    for scatter in np.sqrt(np.mean((off / np.median(errors, axis=1, keepdims=True)) ** 2, axis=(1, 2))):
+        assert low < scatter < high
 
 
 @pytest.mark.parametrize("other", [53.7, 85.0])
