@@ -90,9 +90,24 @@ def irregular(rng, n, interval=1.0):
     return interval * np.append(0.0, np.cumsum(rng.uniform(0.5, 1.5, n - 1)))
 
 
-def coloured_noise(rng, n, pole=0.0):
-    """Return AR(1) noise of deviation 1, after its transient."""
-    return lfilter([1.0], [1.0, -pole], np.sqrt(1 - pole**2) * rng.standard_normal(n + 200))[200:]
+def impulse_response(colour):
+    """Return the impulse response of autoregressive noise of deviation 1 from its real roots."""
+    roots = np.atleast_1d(colour)
+    response = lfilter([1.0], np.poly(roots), np.eye(1, 200 if roots.max() < 0.9 else 5000)[0])
+    return response / np.linalg.norm(response)
+
+
+def coloured_noise(rng, n, colour=0.0):
+    """Return autoregressive noise of deviation 1 from its real roots, after its transient."""
+    before = impulse_response(colour)
+    drawn = rng.standard_normal(n + before.size)
+    return lfilter(before[:1], np.poly(np.atleast_1d(colour)), drawn)[before.size :]
+
+
+def correlation(n, colour=0.0):
+    """Return the correlation matrix of autoregressive noise."""
+    response = impulse_response(colour)
+    return toeplitz([response[k:] @ response[: max(response.size - k, 0)] for k in range(n)])
 
 
 def packed(systems):
@@ -251,7 +266,7 @@ def simulated(
     ramp = since / since[-1]
     deviation = 10 ** (-db / 20) * (np.abs(x) if proportional else np.full(own.size, x.std()))
     y = x + (offset + drift * ramp) * x.std() + deviation * coloured_noise(rng, own.size, colour)
-    noise = deviation * toeplitz(colour ** np.arange(own.size)) * deviation[:, None]
+    noise = deviation * correlation(own.size, colour) * deviation[:, None]
     if quantum:
         y = quantum * x.std() * np.round(y / (quantum * x.std()))
         noise = noise + rounding_covariance(x, quantum * x.std(), deviation[0])
@@ -540,10 +555,12 @@ def long_delay(rng, number):
 # --- kinds with a given structure, for the lengths of intervals ----------------------------------------
 
 
-def typed(poles, zeros, reach, **own):
-    """Return the given structure with all else chosen, and the same structure with an estimated offset."""
+def one_of(rng, poles, zeros, reach, label="", **own):
+    """Return one estimator of a given structure: all else is chosen, or it is a class with an estimated offset."""
     chosen = Given(poles=poles, zeros=zeros, delay_bounds=reach)
-    return {"typed": chosen, "class": DelayProfile(poles, zeros, reach, offset="estimate", **own)}
+    estimators = {"typed": chosen, "class": DelayProfile(poles, zeros, reach, offset="estimate", **own)}
+    name = ("typed", "class")[int(rng.integers(2))]
+    return {f"{label}, {name}" if label else name: estimators[name]}
 
 
 def kept(rng, n, low, high, values):
@@ -570,10 +587,12 @@ def building(rng, number):
         name: TransferFunction(gain * a[-1] * np.array([zero, 1.0]), a)
         for (name, gain), zero in zip(gains.items(), zeros, strict=True)
     }
-    noise = {"db": -20 * np.log10(rng.uniform(0.05, 0.15)), "colour": rng.uniform(0.98, 0.995), "offset": 4.0}
+    roots = [rng.uniform(0.98, 0.995), rng.uniform(0.85, 0.97)][: 1 + number % 2]
+    noise = {"db": -20 * np.log10(rng.uniform(0.05, 0.15)), "colour": roots, "offset": 4.0}
     delays = tuple(f"{name}_delay" for name in inputs)
     case = simulated(rng, systems, t, inputs, first=first, moving=True, common=True, known=delays, **noise)
-    return case.fitted_with(**typed(2, 1, (0.0, 0.0), initial_state="estimate"))
+    label = f"AR({len(roots)})"
+    return case.fitted_with(**one_of(rng, 2, 1, (0.0, 0.0), label, initial_state="estimate"))
 
 
 def quantised(rng, number):
@@ -586,8 +605,7 @@ def quantised(rng, number):
     ]
     noise = {"db": 20 * np.log10(20.0), "offset": rng.uniform(-3.0, 3.0), "quantum": quantum}
     case = simulated(rng, system, np.arange(float(n)), u, **noise)
-    options = typed(poles, 0, (0.0, 10.0))
-    return case.fitted_with(**{f"{quantum}, {name}": each for name, each in options.items()})
+    return case.fitted_with(**one_of(rng, poles, 0, (0.0, 10.0), f"{quantum}"))
 
 
 def short_record(rng, number):
@@ -596,8 +614,7 @@ def short_record(rng, number):
     system = drawn_system(rng, poles, slowest, rng.uniform(0.0, 5.0))
     held, noise = max(2, round(0.7 * slowest)), drawn_noise(rng) | {"colour": colour}
     case = binary_record(rng, system, np.arange(float(n)), held, **noise)
-    label = "AR" if colour else "white"
-    return case.fitted_with(**{f"{label}, {name}": each for name, each in typed(poles, 0, (0.0, 10.0)).items()})
+    return case.fitted_with(**one_of(rng, poles, 0, (0.0, 10.0), "AR" if colour else "white"))
 
 
 def noise_model(rng, number):
@@ -607,10 +624,10 @@ def noise_model(rng, number):
     noise = drawn_noise(rng) | {"colour": 0.85}
     case = binary_record(rng, system, np.arange(float(n)), max(2, round(0.7 * slowest)), **noise)
     reach, model = (0.0, 10.0), "arma:1,0"
-    return case.fitted_with(
-        typed=Given(poles=poles, zeros=0, delay_bounds=reach, noise_model=model),
-        rivc=Rivc(poles, 0, reach, offset="estimate", noise_model=model),
-    )
+    chosen = Given(poles=poles, zeros=0, delay_bounds=reach, noise_model=model)
+    estimators = {"typed": chosen, "rivc": Rivc(poles, 0, reach, offset="estimate", noise_model=model)}
+    name = ("typed", "rivc")[int(rng.integers(2))]
+    return case.fitted_with(**{name: estimators[name]})
 
 
 def zero_delay(rng, number):
@@ -618,7 +635,7 @@ def zero_delay(rng, number):
     slowest = rng.uniform(3.0, n / 20)
     system = drawn_system(rng, poles, slowest, (0.0, rng.uniform(0.0, 0.1))[number // 2 % 2], poles - 1)
     case = binary_record(rng, system, np.arange(float(n)), max(2, round(0.7 * slowest)), **drawn_noise(rng))
-    return case.fitted_with(**typed(poles, poles - 1, (0.0, 5.0)))
+    return case.fitted_with(**one_of(rng, poles, poles - 1, (0.0, 5.0)))
 
 
 def collinear(rng, number):
@@ -635,7 +652,7 @@ def collinear(rng, number):
     inputs = {"u1": u1, "u2": u2}
     case = simulated(rng, systems, np.arange(float(n)), inputs, common=True, known=delays, **drawn_noise(rng))
     label, reach = ("known", (0.0, 0.0)) if known else ("range", (0.0, 8.0))
-    return case.fitted_with(**{f"{label}, {name}": each for name, each in typed(1, 0, reach).items()})
+    return case.fitted_with(**one_of(rng, 1, 0, reach, label))
 
 
 def cancelling(rng, number):
@@ -646,7 +663,7 @@ def cancelling(rng, number):
     a, b = np.poly(poles), np.poly([zero])
     system = TransferFunction(b * drawn_gain(rng) * a[-1] / b[-1], a, rng.uniform(0.0, 5.0))
     case = binary_record(rng, system, np.arange(float(n)), max(2, round(0.7 * slowest)), **drawn_noise(rng))
-    return case.fitted_with(**typed(2, 1, (0.0, 10.0)))
+    return case.fitted_with(**one_of(rng, 2, 1, (0.0, 10.0)))
 
 
 def smooth_input(rng, number):
@@ -660,7 +677,7 @@ def smooth_input(rng, number):
     # It begins at zero, where the record begins.
     u = (np.sin(np.outer(t, w) + phases) - np.sin(phases)).sum(axis=1)
     case = simulated(rng, system, t[::fine], HeldSignal(t, u, "foh"), **drawn_noise(rng))
-    return case.fitted_with(**typed(poles, 0, (0.0, 5.0)))
+    return case.fitted_with(**one_of(rng, poles, 0, (0.0, 5.0)))
 
 
 def proportional_noise(rng, number):
@@ -671,7 +688,7 @@ def proportional_noise(rng, number):
     u = kept(rng, n, held, 3 * held, np.array([0.0, 0.5, 1.0, 2.0, 4.0]))
     db = -20 * np.log10(rng.uniform(0.1, 0.2))
     case = simulated(rng, system, np.arange(float(n)), u, db=db, proportional=True)
-    return case.fitted_with(**{f"{poles}, {name}": each for name, each in typed(poles, 0, (0.0, 10.0)).items()})
+    return case.fitted_with(**one_of(rng, poles, 0, (0.0, 10.0), f"{poles}"))
 
 
 KINDS = {
