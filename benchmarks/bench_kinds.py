@@ -23,7 +23,7 @@ models, gain and delay are compared with the equivalent of nearest delay. Warnin
 responses, after a fit, also leave the fit in the table.
 
 At the end, kinds with a given structure are pooled, with 95 % confidence for independent records, and groups with a
-coverage below 91 % are listed.
+coverage below 91 % are listed; "5 %" and "95 %" are quantiles of the relative lengths, and held is in %.
 """
 
 import os
@@ -246,18 +246,18 @@ def share(counts, name="cover", total="given"):
 def print_summary(fits):
     """Print the coverage of all kinds with a given structure, and the groups in which it is low."""
     records = {kind: each for kind, each in fits.items() if kind in GIVEN_KINDS}
-    print("\ngiven structures        n      cover        ref   long   held")
+    print(f"\n{'given structures':18}{'n':>7}{'cover':>14}{'ref':>14}{'long':>7}{'5 %':>7}{'95 %':>7}{'held':>7}")
     low = []
     for group in COLUMNS:
         every = [[rows[group] for _, rows, _ in each.values() if rows] for one in records.values() for each in one]
         row = sum((one for record in every for one, _ in record), Counter())
         lengths = [length for record in every for _, each in record for length in each]
         cover, ref = (
-            f"{100 * found:5.1f} +- {100 * half:3.1f}"
-            for found, half in (share(every), share(every, "ref", "compared"))
+            f"{100 * found:7.1f} +-{100 * half:4.1f}" for found, half in (share(every), share(every, "ref", "compared"))
         )
-        long, held = 100 * np.median(lengths or [np.nan]), 100 * row["held"] / max(row["n"], 1)
-        print(f"{group:18}{row['n']:7d} {cover} {ref} {long:6.0f} {held:6.1f}")
+        long, low_end, high_end = 100 * np.quantile(lengths or [np.nan], [0.5, 0.05, 0.95])
+        held = 100 * row["held"] / max(row["n"], 1)
+        print(f"{group:18}{row['n']:7d}{cover}{ref}{long:7.0f}{low_end:7.0f}{high_end:7.0f}{held:7.1f}")
         for kind, one in records.items():
             for variant in sorted({variant for each in one for variant in each}):
                 cell = [[each[variant][1][group]] for each in one if variant in each and each[variant][1]]
