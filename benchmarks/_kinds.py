@@ -576,7 +576,7 @@ def building(rng, number):
     clouds = np.interp(t, t[::8], rng.uniform(0.0, 1.0, t[::8].size))
     day = np.sin(2 * np.pi * (t - 8.0) / 24.0)
     inputs = {
-        "heat": kept(rng, t.size, 4, 24, [0.0, 0.5, 1.0, 2.0]),
+        "heat": kept(rng, t.size, *((4, 24), (24, 96))[number // 2 % 2], [0.0, 0.5, 1.0, 2.0]),
         "outside": 4.0 * day + weather,
         "sun": np.maximum(day, 0.0) * clouds,
     }
@@ -587,11 +587,12 @@ def building(rng, number):
         name: TransferFunction(gain * a[-1] * np.array([zero, 1.0]), a)
         for (name, gain), zero in zip(gains.items(), zeros, strict=True)
     }
-    roots = [rng.uniform(0.98, 0.995), rng.uniform(0.85, 0.97)][: 1 + number % 2]
+    # The noise enters at the output, or is a disturbance that passes through the plant.
+    label, through = (("output", []), ("disturbance", np.exp(interval * np.roots(a)).tolist()))[number % 2]
+    roots = [rng.uniform(0.98, 0.995), *through]
     noise = {"db": -20 * np.log10(rng.uniform(0.05, 0.15)), "colour": roots, "offset": 4.0}
     delays = tuple(f"{name}_delay" for name in inputs)
     case = simulated(rng, systems, t, inputs, first=first, moving=True, common=True, known=delays, **noise)
-    label = f"AR({len(roots)})"
     return case.fitted_with(**one_of(rng, 2, 1, (0.0, 0.0), label, initial_state="estimate"))
 
 
