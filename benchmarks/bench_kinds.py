@@ -215,7 +215,9 @@ def percent(counts, columns):
     total = {"cover": row["given"], "sign": row["given"], "ref": row["compared"]}
     found = f"{row['n']:5d}"
     for name in columns:
-        part, whole = (np.median(lengths or [0.0]), len(lengths) > 0) if name == "long" else (row[name], row["n"])
+        part, whole = (
+            (min(np.median(lengths or [0.0]), 99.0), len(lengths) > 0) if name == "long" else (row[name], row["n"])
+        )
         whole = total.get(name, whole)
         found += f"{100 * part / whole:6.0f}" if whole else "     -"
     return found
