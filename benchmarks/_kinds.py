@@ -6,7 +6,7 @@ The makers take all properties but the noise; the kinds draw these and the optio
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import toeplitz
+from scipy.linalg import solve_triangular, toeplitz
 from scipy.signal import lfilter
 
 from ctid_cli import (
@@ -18,27 +18,58 @@ from ctid_cli import (
     HeldSignal,
     InputModel,
     Record,
+    Rivc,
     TransferFunction,
     simulate,
 )
+from ctid_cli.inference.fitted_model import STEP
+
+#: Number of instants of a step response.
+INSTANTS = 13
 
 # --- cases ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Data with their true models by input, and the 95 % half-widths of their quantities; "" is a single input."""
+    """Data with their true models by input; "" is a single input."""
 
     data: object
     systems: dict
+    #: Derivatives of the response by the parameters of the models, and true covariance of the output errors.
+    psi: np.ndarray
+    noise: np.ndarray
+    #: 95 % half-widths of the quantities for the true noise and the treatment that the record needs.
     half_widths: dict
     #: Names of the inputs that repeat, so that other gains and delays are equivalent.
     repeats: tuple = ()
+    #: Whether all inputs have one denominator.
+    common: bool = False
     #: Options by the names of their rows.
     variants: dict = field(default_factory=dict)
 
     def fitted_with(self, **variants):
         return replace(self, variants=variants)
+
+    @property
+    def truth(self):
+        return quantities(unpacked(packed(self.systems), self.systems), self.systems, self.common)
+
+    def reference(self, options, used):
+        """Return the 95 % half-widths of an estimator with these options that knows the noise covariance."""
+        known = {each.name for each in getattr(options, "fixed", None) or ()}
+        own = {each.name: each.delay_bounds for each in getattr(options, "inputs", None) or () if each.delay_bounds}
+        for name in self.systems:
+            low, high = own.get(name, options.delay_bounds)
+            known |= {f"{name}_delay" if name else "delay"} if low == high else set()
+        extra = []
+        if isinstance(self.data, Record):
+            since = self.data.t - self.data.t[0]
+            extra += [np.ones(since.size)] * (options.offset != "none") + [since] * (options.offset == "drift")
+            extra += free_responses(self.systems, since) if options.initial_state == "estimate" else []
+        psi, noise = np.column_stack([self.psi, *extra])[used], self.noise[np.ix_(used, used)]
+        weighted = getattr(options, "noise_model", "white") != "white"
+        return half_widths(self.systems, psi, noise, known, self.common, weighted)
 
 
 def first_order(gain, time_constant, delay=0.0):
@@ -59,9 +90,24 @@ def irregular(rng, n, interval=1.0):
     return interval * np.append(0.0, np.cumsum(rng.uniform(0.5, 1.5, n - 1)))
 
 
-def coloured_noise(rng, n, pole=0.0):
-    """Return AR(1) noise of deviation 1, after its transient."""
-    return lfilter([1.0], [1.0, -pole], np.sqrt(1 - pole**2) * rng.standard_normal(n + 200))[200:]
+def impulse_response(colour):
+    """Return the impulse response of autoregressive noise of deviation 1 from its real roots."""
+    roots = np.atleast_1d(colour)
+    response = lfilter([1.0], np.poly(roots), np.eye(1, 200 if roots.max() < 0.9 else 5000)[0])
+    return response / np.linalg.norm(response)
+
+
+def coloured_noise(rng, n, colour=0.0):
+    """Return autoregressive noise of deviation 1 from its real roots, after its transient."""
+    before = impulse_response(colour)
+    drawn = rng.standard_normal(n + before.size)
+    return lfilter(before[:1], np.poly(np.atleast_1d(colour)), drawn)[before.size :]
+
+
+def correlation(n, colour=0.0):
+    """Return the correlation matrix of autoregressive noise."""
+    response = impulse_response(colour)
+    return toeplitz([response[k:] @ response[: max(response.size - k, 0)] for k in range(n)])
 
 
 def packed(systems):
@@ -78,12 +124,34 @@ def unpacked(theta, like):
     return found
 
 
-def quantities(parts):
-    """Return static gain, delay, time constants, natural frequencies and damping under their printed names."""
-    found = {}
-    for name, (b, a, delay) in parts.items():
+def names_of(systems, common=False):
+    """Return the printed names of the packed parameters; those of a common denominator repeat."""
+    found = []
+    for name, each in systems.items():
         prefix = f"{name}_" if name else ""
-        found |= {f"{prefix}static_gain": b[-1] / a[-1], f"{prefix}delay": delay}
+        found += [f"{prefix}b{k}" for k in range(each.numerator.size)]
+        found += [f"{'' if common else prefix}a{k}" for k in range(1, each.order + 1)] + [f"{prefix}delay"]
+    return found
+
+
+def instants(system):
+    """Return instants of a step response, to four slowest time constants after the delay."""
+    return np.linspace(0.0, system.delay + 4.0 / np.abs(system.poles.real).min(), INSTANTS)
+
+
+def quantities(parts, systems, common=False):
+    """Return coefficients, delay, step response, static gain, time constants, natural frequencies and damping.
+
+    They have their printed names; the step response is that at the instants of the true models.
+    """
+    found = {}
+    for (name, (b, a, delay)), system in zip(parts.items(), systems.values(), strict=True):
+        prefix = f"{name}_" if name else ""
+        found |= dict(zip(names_of({name: system}, common), np.r_[b, a[1:], delay].tolist(), strict=True))
+        step = simulate(TransferFunction(b, a), STEP, instants(system) - delay)
+        found |= {f"{prefix}step {k}": value for k, value in enumerate(step)}
+        found |= {f"{prefix}static_gain": b[-1] / a[-1]}
+        prefix = "" if common else prefix
         poles = np.roots(a)
         upper = sorted((pole for pole in poles if pole.imag >= 0), key=abs, reverse=True)
         for k, pole in enumerate(upper, 1):
@@ -103,61 +171,113 @@ def differences(function, systems, interval):
     for k in range(theta.size):
         step = np.zeros(theta.size)
         step[k] = 1e-4 * interval if k in delays else 1e-6 * abs(theta[k])
-        columns.append((function(theta + step) - function(theta - step)) / (2 * step[k]))
+        below = step if k not in delays or theta[k] >= step[k] else 0.0 * step
+        columns.append((function(theta + step) - function(theta - below)) / (step + below)[k])
     return np.column_stack(columns)
 
 
-def half_widths(systems, psi, noise):
-    """Return 95 % half-widths of all quantities by least squares, linear about the true models, for the true noise."""
+def half_widths(systems, psi, noise, known=(), common=False, weighted=False):
+    """Return 95 % half-widths of all quantities by least squares, linear about the true models, for the true noise.
+
+    Columns of ``psi`` after the parameters are those of further ones. Squares are weighted by the inverse of the noise
+    covariance if wanted.
+    """
+    names = names_of(systems, common)
+    free = [name for name in dict.fromkeys(names) if name not in known]
+    joined = np.array([[name == each for each in free] for name in names], dtype=float)
+    psi = np.column_stack([psi[:, : len(names)] @ joined, psi[:, len(names) :]])
+    if weighted:
+        psi, noise = solve_triangular(np.linalg.cholesky(noise), psi, lower=True), np.eye(len(psi))
     scale = np.maximum(np.linalg.norm(psi, axis=0), 1e-300)
     left, size, right = np.linalg.svd(psi / scale, full_matrices=False)
-    inverse = (right.T / np.maximum(size, 1e-9 * size[0])) @ left.T
-    count = packed(systems).size
-    covariance = (inverse @ noise @ inverse.T)[:count, :count] / np.outer(scale[:count], scale[:count])
-    names = list(quantities(unpacked(packed(systems), systems)))
+    inverse = (right.T / np.maximum(size, 1e-9 * size[0])) @ left.T / scale[:, None]
+    inverse = inverse[: len(free)]
+    covariance = inverse @ noise @ inverse.T
 
     def values(theta):
-        return np.array([*quantities(unpacked(theta, systems)).values()])
+        return np.array([*quantities(unpacked(theta, systems), systems, common).values()])
 
-    gradient = differences(values, systems, 1.0)
+    gradient = differences(values, systems, 1.0) @ joined
     errors = np.sqrt(np.maximum(np.einsum("ik,kl,il->i", gradient, covariance, gradient), 0.0))
-    return dict(zip(names, 1.96 * errors, strict=True))
+    return dict(zip(quantities(unpacked(packed(systems), systems), systems, common), 1.96 * errors, strict=True))
+
+
+def free_responses(systems, since):
+    """Return the free responses of all modes."""
+    modes = dict.fromkeys(pole for each in systems.values() for pole in each.poles if pole.imag >= 0)
+    responses = [np.exp(pole * since) for pole in modes]
+    return [part for each in responses for part in (each.real, each.imag) if part.any()]
+
+
+def rounding_covariance(x, quantum, deviation):
+    """Return the covariance of the errors of rounding outputs plus white noise, for a random offset.
+
+    The error of rounding has the Fourier coefficients ``q/(pi k)``, which noise damps between different samples.
+    """
+    k = np.arange(1, 200)
+    k = k[np.exp(-((2 * np.pi * k * deviation / quantum) ** 2)) > 1e-9]
+    phase = 2 * np.pi / quantum * np.subtract.outer(x, x)
+    damped = quantum**2 / (2 * np.pi**2 * k**2) * np.exp(-((2 * np.pi * k * deviation / quantum) ** 2))
+    found = sum(size * np.cos(each * phase) for each, size in zip(k, damped, strict=True))
+    np.fill_diagonal(found, quantum**2 / 12)
+    return found
 
 
 # --- makers --------------------------------------------------------------------------------------------
 
 
 def simulated(
-    rng, systems, t, inputs, *, first=0, moving=False, repeats=(), db=20.0, colour=0.0, offset=0.0, drift=0.0, plus=0.0
+    rng,
+    systems,
+    t,
+    inputs,
+    *,
+    first=0,
+    moving=False,
+    repeats=(),
+    common=False,
+    known=(),
+    db=20.0,
+    colour=0.0,
+    offset=0.0,
+    drift=0.0,
+    plus=0.0,
+    quantum=0.0,
+    proportional=False,
 ):
     """Return the case of a record that begins with sample ``first`` of a simulation from rest.
 
-    Offset and drift are relative to the deviation of the response; ``plus`` is a part of it outside the model. If the
-    system is moving at the beginning of the record, the bounds include an estimated state and leave out the samples
-    before the delay, whose input is not recorded.
+    Offset, drift and quantum are relative to the deviation of the response; ``plus`` is a part of it outside the model.
+    If the system is moving at the beginning of the record, the bounds include an estimated state and leave out the
+    samples before the delay, whose input is not recorded. Proportional noise has a deviation relative to the magnitude
+    of the response. An input may be a signal, of which the record has the samples.
     """
     systems = systems if isinstance(systems, dict) else {"": systems}
     inputs = inputs if isinstance(inputs, dict) else {"": inputs}
-    signals, own = {name: HeldSignal(t, u) for name, u in inputs.items()}, t[first:]
+    signals = {name: u if isinstance(u, HeldSignal) else HeldSignal(t, u) for name, u in inputs.items()}
+    own = t[first:]
 
     def output(theta):
         parts = unpacked(theta, systems)
         return sum(simulate(TransferFunction(b, a), signals[name], own - tau) for name, (b, a, tau) in parts.items())
 
     x = output(packed(systems)) + plus
-    ramp = (own - own[0]) / (own[-1] - own[0])
-    deviation = 10 ** (-db / 20) * x.std()
+    since = own - own[0]
+    ramp = since / since[-1]
+    deviation = 10 ** (-db / 20) * (np.abs(x) if proportional else np.full(own.size, x.std()))
     y = x + (offset + drift * ramp) * x.std() + deviation * coloured_noise(rng, own.size, colour)
-    held = {name: HeldSignal(own, u[first:]) for name, u in inputs.items()}
+    noise = deviation * correlation(own.size, colour) * deviation[:, None]
+    if quantum:
+        y = quantum * x.std() * np.round(y / (quantum * x.std()))
+        noise = noise + rounding_covariance(x, quantum * x.std(), deviation[0])
+    held = {name: HeldSignal(own, signal.at(own)) for name, signal in signals.items()}
     extra, used = [np.ones(own.size)] + [ramp] * bool(drift), np.ones(own.size, dtype=bool)
     if moving:
-        used = own >= own[0] + max(each.delay for each in systems.values())
-        for pole in (pole for each in systems.values() for pole in each.poles if pole.imag >= 0):
-            free = np.exp(pole * (own - own[0]))
-            extra += [free.real] + [free.imag] * bool(pole.imag)
-    psi = np.column_stack([differences(output, systems, np.diff(own).min()), *extra])[used]
-    noise = deviation**2 * toeplitz(colour ** np.arange(used.sum()))
-    return Case(Record(own, y, held.get("", held)), systems, half_widths(systems, psi, noise), repeats)
+        used = since >= max(each.delay for each in systems.values())
+        extra += free_responses(systems, since)
+    psi = differences(output, systems, np.diff(own).min())
+    widths = half_widths(systems, np.column_stack([psi, *extra])[used], noise[np.ix_(used, used)], known, common)
+    return Case(Record(own, y, held.get("", held)), systems, psi, noise, widths, repeats, common)
 
 
 def square_record(rng, system, n, half, start="cut", low=-1.0, wait=0, interval=0.1, **noise):
@@ -235,9 +355,9 @@ def measured_response(rng, system, frequencies, db=30.0, known=True):
     deviation = 10 ** (-db / 20) * np.sqrt(np.mean(x**2))
     y = x + deviation * rng.standard_normal(2 * count)
     errors = np.full(count, np.sqrt(2.0) * deviation) if known else None
-    psi = differences(output, {"": system}, 1.0 / frequencies[-1])
-    widths = half_widths({"": system}, psi, deviation**2 * np.eye(2 * count))
-    return Case(FrequencyData(frequencies, y[:count] + 1j * y[count:], errors), {"": system}, widths)
+    psi, noise = differences(output, {"": system}, 1.0 / frequencies[-1]), deviation**2 * np.eye(2 * count)
+    data = FrequencyData(frequencies, y[:count] + 1j * y[count:], errors)
+    return Case(data, {"": system}, psi, noise, half_widths({"": system}, psi, noise))
 
 
 # --- kinds ---------------------------------------------------------------------------------------------
@@ -432,6 +552,146 @@ def long_delay(rng, number):
     return case.fitted_with(chosen=Given(), typed=Given(poles=1, zeros=0))
 
 
+# --- kinds with a given structure, for the lengths of intervals ----------------------------------------
+
+
+def one_of(rng, poles, zeros, reach, label="", **own):
+    """Return one estimator of a given structure: all else is chosen, or it is a class with an estimated offset."""
+    chosen = Given(poles=poles, zeros=zeros, delay_bounds=reach)
+    estimators = {"typed": chosen, "class": DelayProfile(poles, zeros, reach, offset="estimate", **own)}
+    name = ("typed", "class")[int(rng.integers(2))]
+    return {f"{label}, {name}" if label else name: estimators[name]}
+
+
+def kept(rng, n, low, high, values):
+    """Return values that are kept for random numbers of samples."""
+    return np.repeat(rng.choice(values, n), rng.integers(low, high, n))[:n]
+
+
+def building(rng, number):
+    """Return a record of room temperature in intervals of half an hour, from weeks before it."""
+    n, first, interval = 1199, 500, 0.5
+    t = interval * np.arange(-first, n)
+    weather = lfilter([1.0], [1.0, -0.99], 0.4 * rng.standard_normal(t.size))
+    clouds = np.interp(t, t[::8], rng.uniform(0.0, 1.0, t[::8].size))
+    day = np.sin(2 * np.pi * (t - 8.0) / 24.0)
+    inputs = {
+        "heat": kept(rng, t.size, *((4, 24), (24, 96))[number // 2 % 2], [0.0, 0.5, 1.0, 2.0]),
+        "outside": 4.0 * day + weather,
+        "sun": np.maximum(day, 0.0) * clouds,
+    }
+    a = np.poly(-1.0 / (np.array([0.9, 16.0]) * rng.uniform(0.7, 1.4, 2)))
+    zeros = rng.uniform(1.0, 4.0, 3)
+    gains = dict(zip(inputs, [rng.uniform(4.0, 7.0), rng.uniform(0.7, 1.0), rng.uniform(2.0, 6.0)], strict=True))
+    systems = {
+        name: TransferFunction(gain * a[-1] * np.array([zero, 1.0]), a)
+        for (name, gain), zero in zip(gains.items(), zeros, strict=True)
+    }
+    # The noise enters at the output, or is a disturbance that passes through the plant.
+    label, through = (("output", []), ("disturbance", np.exp(interval * np.roots(a)).tolist()))[number % 2]
+    roots = [rng.uniform(0.98, 0.995), *through]
+    noise = {"db": -20 * np.log10(rng.uniform(0.05, 0.15)), "colour": roots, "offset": 4.0}
+    delays = tuple(f"{name}_delay" for name in inputs)
+    case = simulated(rng, systems, t, inputs, first=first, moving=True, common=True, known=delays, **noise)
+    return case.fitted_with(**one_of(rng, 2, 1, (0.0, 0.0), label, initial_state="estimate"))
+
+
+def quantised(rng, number):
+    n, poles = int(rng.integers(200, 601)), 1 + number % 2
+    slowest, quantum = rng.uniform(4.0, n / 25), (0.8, 0.3)[number // 2 % 2]
+    system = drawn_system(rng, poles, slowest, rng.uniform(0.0, 5.0))
+    held = max(2, round(slowest * rng.uniform(0.7, 2.5)))
+    u = (square(np.arange(n), held), binary(rng, n, held), kept(rng, n, held, 3 * held, np.linspace(-2, 2, 9)))[
+        number // 4 % 3
+    ]
+    noise = {"db": 20 * np.log10(20.0), "offset": rng.uniform(-3.0, 3.0), "quantum": quantum}
+    case = simulated(rng, system, np.arange(float(n)), u, **noise)
+    return case.fitted_with(**one_of(rng, poles, 0, (0.0, 10.0), f"{quantum}"))
+
+
+def short_record(rng, number):
+    n, poles, colour = int(rng.integers(60, 121)), 1 + (number % 3 == 2), 0.7 * (number % 2)
+    slowest = rng.uniform(3.0, n / 12)
+    system = drawn_system(rng, poles, slowest, rng.uniform(0.0, 5.0))
+    held, noise = max(2, round(0.7 * slowest)), drawn_noise(rng) | {"colour": colour}
+    case = binary_record(rng, system, np.arange(float(n)), held, **noise)
+    return case.fitted_with(**one_of(rng, poles, 0, (0.0, 10.0), "AR" if colour else "white"))
+
+
+def noise_model(rng, number):
+    n, poles = 200, 1 + number % 2
+    slowest = rng.uniform(3.0, 10.0)
+    system = drawn_system(rng, poles, slowest, rng.uniform(0.0, 5.0))
+    noise = drawn_noise(rng) | {"colour": 0.85}
+    case = binary_record(rng, system, np.arange(float(n)), max(2, round(0.7 * slowest)), **noise)
+    reach, model = (0.0, 10.0), "arma:1,0"
+    chosen = Given(poles=poles, zeros=0, delay_bounds=reach, noise_model=model)
+    estimators = {"typed": chosen, "rivc": Rivc(poles, 0, reach, offset="estimate", noise_model=model)}
+    name = ("typed", "rivc")[int(rng.integers(2))]
+    return case.fitted_with(**{name: estimators[name]})
+
+
+def zero_delay(rng, number):
+    n, poles = int(rng.integers(200, 401)), 1 + number % 2
+    slowest = rng.uniform(3.0, n / 20)
+    system = drawn_system(rng, poles, slowest, (0.0, rng.uniform(0.0, 0.1))[number // 2 % 2], poles - 1)
+    case = binary_record(rng, system, np.arange(float(n)), max(2, round(0.7 * slowest)), **drawn_noise(rng))
+    return case.fitted_with(**one_of(rng, poles, poles - 1, (0.0, 5.0)))
+
+
+def collinear(rng, number):
+    n, held, correlation = int(rng.integers(250, 501)), int(rng.integers(3, 9)), rng.uniform(0.95, 0.99)
+    u1, other = (kept(rng, n, held, 3 * held, rng.standard_normal(n)) for _ in range(2))
+    u2 = correlation * u1 + np.sqrt(1 - correlation**2) * other
+    slowest, known = rng.uniform(3.0, n / 20), number % 2 == 0
+    a = np.array([1.0, 1.0 / slowest])
+    systems = {
+        name: TransferFunction([drawn_gain(rng) / slowest], a, 0.0 if known else rng.uniform(0.0, 4.0))
+        for name in ("u1", "u2")
+    }
+    delays = ("u1_delay", "u2_delay") if known else ()
+    inputs = {"u1": u1, "u2": u2}
+    case = simulated(rng, systems, np.arange(float(n)), inputs, common=True, known=delays, **drawn_noise(rng))
+    label, reach = ("known", (0.0, 0.0)) if known else ("range", (0.0, 8.0))
+    return case.fitted_with(**one_of(rng, 1, 0, reach, label))
+
+
+def cancelling(rng, number):
+    n = int(rng.integers(250, 501))
+    slowest = rng.uniform(5.0, n / 20)
+    poles = np.array([-1.0, -rng.uniform(2.0, 5.0)]) / slowest
+    zero = poles[number % 2] * (1 + rng.choice([-1.0, 1.0]) * rng.uniform(0.03, 0.15))
+    a, b = np.poly(poles), np.poly([zero])
+    system = TransferFunction(b * drawn_gain(rng) * a[-1] / b[-1], a, rng.uniform(0.0, 5.0))
+    case = binary_record(rng, system, np.arange(float(n)), max(2, round(0.7 * slowest)), **drawn_noise(rng))
+    return case.fitted_with(**one_of(rng, 2, 1, (0.0, 10.0)))
+
+
+def smooth_input(rng, number):
+    """Return samples of a smooth input, simulated from a finer grid with straight lines between its points."""
+    n, poles, fine = int(rng.integers(250, 401)), 1 + number % 2, 20
+    slowest = rng.uniform(3.0, n / 20)
+    system = drawn_system(rng, poles, slowest, rng.uniform(0.0, 3.0))
+    t = np.arange(fine * n) / fine
+    w = np.linspace(0.1, min(3.0, 0.8 * slowest), 12) / slowest
+    phases = rng.uniform(0, 2 * np.pi, w.size)
+    # It begins at zero, where the record begins.
+    u = (np.sin(np.outer(t, w) + phases) - np.sin(phases)).sum(axis=1)
+    case = simulated(rng, system, t[::fine], HeldSignal(t, u, "foh"), **drawn_noise(rng))
+    return case.fitted_with(**one_of(rng, poles, 0, (0.0, 5.0)))
+
+
+def proportional_noise(rng, number):
+    n, poles = int(rng.integers(200, 401)), 1 + number % 2
+    slowest = rng.uniform(3.0, n / 20)
+    system = drawn_system(rng, poles, slowest, rng.uniform(0.0, 5.0))
+    held = max(2, round(slowest * rng.uniform(0.7, 2.5)))
+    u = kept(rng, n, held, 3 * held, np.array([0.0, 0.5, 1.0, 2.0, 4.0]))
+    db = -20 * np.log10(rng.uniform(0.1, 0.2))
+    case = simulated(rng, system, np.arange(float(n)), u, db=db, proportional=True)
+    return case.fitted_with(**one_of(rng, poles, 0, (0.0, 10.0), f"{poles}"))
+
+
 KINDS = {
     "square": square_wave,
     "period": whole_periods,
@@ -445,3 +705,16 @@ KINDS = {
     "two-inputs": two_inputs,
     "long-delay": long_delay,
 }
+#: Kinds of which the structure is given.
+GIVEN_KINDS = {
+    "building": building,
+    "quantised": quantised,
+    "short": short_record,
+    "arma": noise_model,
+    "zero-delay": zero_delay,
+    "collinear": collinear,
+    "cancelling": cancelling,
+    "smooth": smooth_input,
+    "proportional": proportional_noise,
+}
+KINDS |= GIVEN_KINDS
