@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import freeze, require_choice
 from ctid_cli.signals.data_checks import Rows, check_input, check_output, check_times
@@ -19,6 +20,9 @@ from ctid_cli.signals.treatment import Holds
 
 #: Where the reference enters a loop.
 Enters = Literal["controller", "input"]
+#: Records of different lengths overlap if all samples at common instants agree and the output changes this many times
+#: among them: outputs at rest or in coarse steps agree by chance.
+FEW_CHANGES = 20
 
 
 class Controller(Protocol):
@@ -297,12 +301,54 @@ def beginning(record: Record, samples: int) -> Record:
 
 
 def common_samples(record: Record, others: Sequence[Record]) -> int:
-    """Return how many samples of a record are those of others, with which it agrees at all instants they share."""
-    found = 0
-    for other in others:
-        _, own, theirs = np.intersect1d(record.t, other.t, assume_unique=True, return_indices=True)
-        found += own.size * np.array_equal(record.y[own], other.y[theirs], equal_nan=True)
-    return found
+    """Return how many samples of a record others have too, perhaps with times shifted by a constant."""
+    return sum(_shared(record, other) for other in others)
+
+
+def _shared(one: Record, other: Record) -> int:
+    """Return the number of common samples of two records that are copies of each other or overlap; 0 for others."""
+    at_start = float(other.t[0] - one.t[0])
+    few = slice(None, None, max(one.n_samples // FEW_CHANGES, 1))
+    for shift in dict.fromkeys([0.0, at_start, *_shifts(one, other), *(-each for each in _shifts(other, one))]):
+        # Most records differ at the first samples that are compared.
+        for part in few, slice(None):
+            own, theirs = _at_same_times(one.t[part] + shift, other.t)
+            y, equal = one.y[part][own], other.y[theirs]
+            if not np.array_equal(y, equal, equal_nan=True):
+                break
+        else:
+            whole = own.size == one.n_samples == other.n_samples
+            changes = np.count_nonzero(np.diff(y[np.isfinite(y)]))
+            each = list(zip(one.held.values(), other.held.values(), strict=False))
+            same = (_same_input(*pair, one.t[own], other.t[theirs]) for pair in each)
+            if changes >= (1 if whole else FEW_CHANGES) and len(one.held) == len(other.held) and all(same):
+                return int(own.size)
+    return 0
+
+
+def _shifts(one: Record, other: Record) -> list[float]:
+    """Return the shifts of time at which the beginning of a record, from its first change on, is in another."""
+    own, valid = np.flatnonzero(one.valid), np.flatnonzero(other.valid)
+    changed = np.flatnonzero(np.diff(one.y[own]))
+    own = own[changed[:1].sum() :][: min(2 * FEW_CHANGES, valid.size)]
+    places = np.arange(valid.size - own.size + 1) if changed.size else np.arange(0)
+    for k, value in enumerate(one.y[own]):
+        places = places[other.y[valid[places + k]] == value]
+    return (other.t[valid[places]] - one.t[own[0]]).tolist()
+
+
+def _at_same_times(one: Array, other: Array) -> tuple[IndexArray, IndexArray]:
+    """Return the indices of equal instants of two clocks, up to rounding."""
+    slack = 1e-4 * float(other[-1] - other[0]) / max(other.size - 1, 1)
+    places = np.minimum(np.searchsorted(other, one - slack), other.size - 1)
+    found = np.flatnonzero(np.abs(other[places] - one) <= slack)
+    return found, places[found]
+
+
+def _same_input(one: HeldSignal, other: HeldSignal, own: Array, theirs: Array) -> bool:
+    """Return whether two inputs are equal at instants, as far as both are known there."""
+    known = (own >= one.t[0]) & (theirs >= other.t[0])
+    return bool(known.any()) and np.allclose(one.at(own[known]), other.at(theirs[known]), rtol=1e-9, atol=0.0)
 
 
 def _named_inputs(
@@ -324,11 +370,16 @@ def _named_inputs(
 
 
 def as_records(records: Any) -> list[Record]:
-    """Return one record or several as a list; a DataError where something else is given."""
+    """Return one record or several as a list; a DataError for anything else, and for records that overlap."""
     several = list(records) if isinstance(records, Iterable) else [records]
     for one in several:
         if not isinstance(one, Record):
             raise DataError(f"records must be a Record or a list of these, not {type(records).__name__}")
+    for (k, one), (later, other) in combinations(enumerate(several, start=1), 2):
+        if shared := _shared(one, other):
+            names = [f"{number}{f' ({each.name})' * bool(each.name)}" for number, each in ((k, one), (later, other))]
+            what = f"records {' and '.join(names)} have {shared} of their samples in common, input and output"
+            raise DataError(f"{what}: a copy makes standard errors too small; give each measured sample once")
     return several
 
 
