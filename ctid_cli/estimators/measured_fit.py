@@ -24,10 +24,12 @@ from ctid_cli.inference.fit import DeferredFields, Fit, InputFit, Status
 from ctid_cli.inference.innovations import NoiseFit
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_covariance, orders_of
+from ctid_cli.inference.parameter_change import ParameterChange, Quantity, parameter_change
 from ctid_cli.inference.repetition import Equivalent
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
+from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAW, DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
-from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of
+from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of, is_delay
 from ctid_cli.progress import calling
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.text import listed
@@ -103,6 +105,8 @@ class MeasuredFit(DeferredFields, Fit):
         95 % intervals of parameters that do not follow from the covariance.
     other_minima : tuple of Begin
         Starts of further minima of the search that are nearly as low.
+    change : ParameterChange or None
+        Different parameters of the halves of a record, or of several records; None if equal ones are not rejected.
     """
 
     deferred: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
@@ -129,6 +133,7 @@ class MeasuredFit(DeferredFields, Fit):
     undetermined: Mapping[str, str] = field(default_factory=dict)
     intervals: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
     other_minima: tuple[Begin, ...] = ()
+    change: ParameterChange | None = None
 
     @property
     def standard_errors(self) -> dict[str, float]:
@@ -156,7 +161,8 @@ class MeasuredFit(DeferredFields, Fit):
         if self.undetermined:
             found.append(f"Not determined: {listed(self.undetermined)}.")
         each = ((name, pieces) for name, pieces in self.intervals.items() if len(pieces) > 1)
-        return found + [several_intervals(name, pieces) for name, pieces in each]
+        found += [several_intervals(name, pieces) for name, pieces in each]
+        return found + ([] if self.change is None else [f"{self.change.sentence}."])
 
     def _repeating(self, time_unit: str) -> list[str]:
         """Return the models that a repeating input cannot tell apart, in sentences."""
@@ -201,7 +207,29 @@ class MeasuredFit(DeferredFields, Fit):
         """Return the fit with its uncertainty; singular if it converged but has no covariance."""
         undefined = law.kind != "biased" and not np.isfinite(law.free_covariance).all()
         singular = self.status is Status.CONVERGED and undefined
-        return replace(self, covariance=law.covariance, law=law, status=Status.SINGULAR if singular else self.status)
+        status, change = Status.SINGULAR if singular else self.status, None if law.kind == "biased" else self._change()
+        return replace(self, covariance=law.covariance, law=law, status=status, change=change)
+
+    def _change(self) -> ParameterChange | None:
+        """Return a change of the parameters between the halves of a record, or between records."""
+        linear, tangent = self.linear, self.tangent
+        shared = np.array([re.fullmatch(r"(.+_)?([ab]\d+|delay)", name) is not None for name in self.parameter_names])
+        slopes = [psi @ tangent for psi in linear.sensitivities]
+        return parameter_change(slopes, linear.residuals, tangent[shared].any(axis=0), self._quantities)
+
+    def _quantities(self) -> list[Quantity]:
+        """Return the static gains and the common parameters with their derivatives along the free directions."""
+        parts = self.model.parts if isinstance(self.model, MultiInputModel) else {"": self.parametrised}
+        found = []
+        for name, part in parts.items():
+            own = (each.removeprefix(f"{name}_") if name else each for each in self.parameter_names)
+            bare = tuple(each if re.fullmatch(r"(g\d+_)?[ab]\d+|delay", each) else f"other {each}" for each in own)
+            gain, slopes = float(part.dc_gain), Parametric(part, bare)
+            if np.isfinite(gain):
+                by_theta = slopes.frequency_slopes(np.zeros(1))[0].real
+                found.append(Quantity(f"{name} static gain".lstrip(), gain, by_theta @ self.tangent, True))
+        each = zip(self.parameter_names, self.theta.tolist(), self.tangent, strict=True)
+        return found + [Quantity(*one, is_delay(one[0])) for one in each]
 
     @property
     def signs_known(self) -> bool:
@@ -277,7 +305,7 @@ class MultiInputFit(MeasuredFit):
         As in :class:`MeasuredFit`; ``input_offsets`` has those of all inputs, record by record.
     poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met, equivalents, undetermined
         As in :class:`MeasuredFit`.
-    intervals, other_minima
+    intervals, other_minima, change
         As in :class:`MeasuredFit`.
     """
 

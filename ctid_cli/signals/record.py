@@ -334,7 +334,8 @@ def _shifts(one: Record, other: Record) -> list[float]:
     places = np.arange(valid.size - own.size + 1) if changed.size else np.arange(0)
     for k, value in enumerate(one.y[own]):
         places = places[other.y[valid[places + k]] == value]
-    return (other.t[valid[places]] - one.t[own[0]]).tolist()
+    found: list[float] = (other.t[valid[places]] - one.t[own[0]]).tolist()
+    return found
 
 
 def _at_same_times(one: Array, other: Array) -> tuple[IndexArray, IndexArray]:
