@@ -47,7 +47,7 @@ class FrequencyDomainFit(MeasuredFit):
         then the imaginary parts.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
-    equivalents, undetermined, intervals, other_minima, change
+    equivalents, undetermined, intervals, other_minima, change, assumed_hold
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     data : FrequencyData
         Frequency response.
@@ -167,7 +167,7 @@ class FrequencyDomainSumFit(FrequencyDomainFit, SubmodelsFit):
         As in :class:`FrequencyDomainFit`.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`FrequencyDomainFit`.
-    equivalents, undetermined, intervals, other_minima, change
+    equivalents, undetermined, intervals, other_minima, change, assumed_hold
         As in :class:`FrequencyDomainFit`.
     additive, start_method, loop_radius, in_loop, consistency, sampling, two_stage
         As in :class:`~ctid_cli.estimators.measured_submodels.SubmodelsFit`; only the first two apply.

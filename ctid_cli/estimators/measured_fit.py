@@ -19,11 +19,12 @@ from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimation.parameter_layout import Layout
 from ctid_cli.estimation.robust_fit import RobustFit
 from ctid_cli.filtering.bank import Equations
-from ctid_cli.inference.criteria import percent_from_r_squared
+from ctid_cli.inference.criteria import LIKELY, percent_from_r_squared, squared_innovations
 from ctid_cli.inference.fit import DeferredFields, Fit, InputFit, Status
 from ctid_cli.inference.innovations import NoiseFit
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_covariance, orders_of
+from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.inference.parameter_change import ParameterChange, Quantity, parameter_change
 from ctid_cli.inference.repetition import Equivalent
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
@@ -55,7 +56,7 @@ class MeasuredFit(DeferredFields, Fit):
 
     Parameters
     ----------
-    model, parameter_names, covariance, status, r2, count, condition_number, law, in_ignored_loop
+    model, parameter_names, covariance, status, r2, count, condition_number, law, in_ignored_loop, assumed_hold
         As in :class:`~ctid_cli.inference.fit.Fit`.
     cost : float
         Mean squared output error over the used samples, or twice the mean of another loss [output unit^2].
@@ -145,7 +146,7 @@ class MeasuredFit(DeferredFields, Fit):
         return found | dict.fromkeys(self.undetermined, np.nan)
 
     def marks(self, time_unit: str = "s") -> list[str]:
-        """Return what the records do not determine, and what a repeating input cannot tell apart, in sentences.
+        """Return what the records do not determine or do not agree on, and what a repeating input cannot tell apart.
 
         Parameters
         ----------
@@ -157,7 +158,7 @@ class MeasuredFit(DeferredFields, Fit):
         list of str
             One sentence for each; empty if there is nothing to say.
         """
-        found = self._repeating(time_unit)
+        found = super().marks(time_unit) + self._repeating(time_unit)
         if self.undetermined:
             found.append(f"Not determined: {listed(self.undetermined)}.")
         each = ((name, pieces) for name, pieces in self.intervals.items() if len(pieces) > 1)
@@ -209,6 +210,37 @@ class MeasuredFit(DeferredFields, Fit):
         singular = self.status is Status.CONVERGED and undefined
         status, change = Status.SINGULAR if singular else self.status, None if law.kind == "biased" else self._change()
         return replace(self, covariance=law.covariance, law=law, status=status, change=change)
+
+    @property
+    def _misfit(self) -> float:
+        """Mean loss, or with a noise model the geometric mean of the variance of its innovations."""
+        return self.cost if self.noise is None else float(np.exp(self.noise.deviance / self.count))
+
+    def _is_likely_as(self, best: Self) -> bool:
+        """Return whether the data do not reject this fit against a better one, in noise of its colour."""
+        linear = self.linear, best.linear
+        noise = fit_noise_model(linear[1].residuals, penalty=float(np.log(best.count)))
+        own, least = (
+            squared_innovations(each.residuals, [psi @ each.tangent for psi in each.sensitivities], noise)
+            for each in linear
+        )
+        return best.count * np.log(own / least) <= LIKELY if least > 0.0 else False
+
+    def _joined(self, others: Sequence[Self]) -> Self:
+        """Return the fit with intervals of the delays that contain those of other fits."""
+        found = dict(self.intervals)
+        for name in delay_names(self):
+            pieces = [pair for fit in (self, *others) for pair in fit._intervals_of(name)]
+            if pieces and np.isfinite(pieces).all():
+                found[name] = ((max(min(low for low, _ in pieces), 0.0), max(high for _, high in pieces)),)
+        return replace(self, intervals=found)
+
+    def _intervals_of(self, name: str) -> tuple[tuple[float, float], ...]:
+        """Return the 95 % intervals of a parameter; none if it is not estimated."""
+        if name not in self.parameter_names or name in self.intervals:
+            return self.intervals.get(name, ())
+        value, reach = self.parameters[name], self.quantiles[name] * self.standard_errors[name]
+        return ((value - reach, value + reach),)
 
     def _change(self) -> ParameterChange | None:
         """Return a change of the parameters between the halves of a record, or between records."""
@@ -305,7 +337,7 @@ class MultiInputFit(MeasuredFit):
         As in :class:`MeasuredFit`; ``input_offsets`` has those of all inputs, record by record.
     poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met, equivalents, undetermined
         As in :class:`MeasuredFit`.
-    intervals, other_minima, change
+    intervals, other_minima, change, assumed_hold
         As in :class:`MeasuredFit`.
     """
 

@@ -81,14 +81,8 @@ def parameter_change(
 ) -> ParameterChange | None:
     """Return a change of the parameters that all records have in common; None if none is significant.
 
-    Parameters
-    ----------
-    psi, residuals : sequence of ndarray
-        Sensitivities along the free directions of the parameters, shape (count, f), and errors of each record.
-    common : ndarray of bool, shape (f,)
-        Mask of the directions that change common parameters.
-    quantities : callable
-        Returns the quantities of which one is named.
+    The sensitivities psi of each record, shape (count, f), are along the f free directions of the parameters; ``common``
+    is the mask of those that change common ones. One of the quantities is named.
     """
     sizes, several = [len(block) for block in psi], len(psi) > 1
     count = sum(sizes)

@@ -91,7 +91,7 @@ class Record:
         Output samples [output unit]; a NaN is a masked (missing) sample.
     inputs : HeldSignal, or mapping of names to HeldSignal or array_like
         The input on its own break times [s]; or several inputs by name. Values without times belong to the instants of
-        the output, each held until the next one (zoh).
+        the output; their hold is not given, as with :meth:`from_arrays`.
     noise_free : ndarray, shape (N,), optional
         The output without noise [output unit], known only for simulated records.
     name : str, default ""
@@ -161,7 +161,7 @@ class Record:
             raise DataError(f"{where}in a closed loop {what}; give its values at the samples")
 
     @classmethod
-    def from_arrays(cls, t: ArrayLike, u: ArrayLike, y: ArrayLike, hold: Hold = "zoh", name: str = "") -> Record:
+    def from_arrays(cls, t: ArrayLike, u: ArrayLike, y: ArrayLike, hold: Hold | None = None, name: str = "") -> Record:
         """Make a record whose input is given at the instants of the output.
 
         Parameters
@@ -172,8 +172,9 @@ class Record:
             Input samples [input unit].
         y : array_like, shape (N,)
             Output samples [output unit]; NaN marks a missing sample.
-        hold : {"zoh", "foh", "band-limited"}, default "zoh"
-            Interpolation of the input between its samples.
+        hold : {"zoh", "foh", "band-limited"}, optional
+            Interpolation of the input between its samples. If it is not given, an input that changes in steps is
+            ``zoh``; of a smooth one, estimators take ``zoh`` or ``foh``, whichever fits better, and say so.
         name : str, default ""
             Name in messages.
 
@@ -183,7 +184,8 @@ class Record:
             The record.
         """
         times = np.asarray(t, dtype=float)
-        return cls(times, np.asarray(y, dtype=float), HeldSignal(times, np.asarray(u, dtype=float), hold), name=name)
+        signal = HeldSignal(times, np.asarray(u, dtype=float), hold or "zoh", assumed=hold is None)
+        return cls(times, np.asarray(y, dtype=float), signal, name=name)
 
     @property
     def held(self) -> dict[str, HeldSignal]:
@@ -221,6 +223,11 @@ class Record:
         """Hold of the inputs; a tuple if they differ."""
         each = tuple(signal.hold for signal in self.held.values())
         return each[0] if len(set(each)) == 1 else each
+
+    @property
+    def hold_assumed(self) -> bool:
+        """Whether the hold of an input was not given."""
+        return any(signal.assumed for signal in self.held.values())
 
     @property
     def hold_options(self) -> list[str]:
@@ -300,6 +307,15 @@ def beginning(record: Record, samples: int) -> Record:
     return Record(t, record.y[:samples], inputs, name=record.name)
 
 
+def with_hold(record: Record, hold: Holds) -> Record:
+    """Return a record with a given hold of its inputs."""
+    if record.hold == hold and not record.hold_assumed:
+        return record
+    holds = [hold] * len(record.held) if isinstance(hold, str) else hold
+    each = zip(record.held.items(), holds, strict=True)
+    return replace(record, inputs={name: HeldSignal(one.t, one.values, own) for (name, one), own in each})
+
+
 def common_samples(record: Record, others: Sequence[Record]) -> int:
     """Return how many samples of a record others have too, perhaps with times shifted by a constant."""
     return sum(_shared(record, other) for other in others)
@@ -365,7 +381,7 @@ def _named_inputs(
     if not inputs:
         raise DataError(f"{where}there is no input")
     return {
-        name: one if isinstance(one, HeldSignal) else HeldSignal(t, np.asarray(one, dtype=float))
+        name: one if isinstance(one, HeldSignal) else HeldSignal(t, np.asarray(one, dtype=float), assumed=True)
         for name, one in inputs.items()
     }
 
