@@ -19,7 +19,7 @@ from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimation.parameter_layout import Layout
 from ctid_cli.estimation.robust_fit import RobustFit
 from ctid_cli.filtering.bank import Equations
-from ctid_cli.inference.criteria import LIKELY, percent_from_r_squared, squared_innovations
+from ctid_cli.inference.criteria import HOLD_REJECTED, percent_from_r_squared, squared_innovations
 from ctid_cli.inference.fit import DeferredFields, Fit, InputFit, Status
 from ctid_cli.inference.innovations import NoiseFit
 from ctid_cli.inference.model_responses import Estimated
@@ -224,7 +224,7 @@ class MeasuredFit(DeferredFields, Fit):
             squared_innovations(each.residuals, [psi @ each.tangent for psi in each.sensitivities], noise)
             for each in linear
         )
-        return best.count * np.log(own / least) <= LIKELY if least > 0.0 else False
+        return best.count * np.log(own / least) <= HOLD_REJECTED if least > 0.0 else False
 
     def _joined(self, others: Sequence[Self]) -> Self:
         """Return the fit with intervals of the delays that contain those of other fits."""

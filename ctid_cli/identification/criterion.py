@@ -22,7 +22,6 @@ from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
 from ctid_cli.inference.covariance import LARGEST_CONDITION
 from ctid_cli.inference.criteria import (
-    LIKELY,
     InformationCriteria,
     information_criteria,
     innovations_count,
@@ -40,6 +39,9 @@ Searched = DelayProfile | AdditiveOutputError
 PENALTY = 1.5
 #: Options of the treatment of records, and increase of the criterion from which one is rejected.
 TREATMENT, CLEARLY_WORSE = ("initial_state", "input_before", "offset"), 10.0
+#: Increase of the criterion up to which models with equal parameters are likely: 95 % of chi-square with one degree of
+#: freedom.
+LIKELY = 3.84
 #: Decrease of the criterion from which a drift is estimated.
 WORTH_A_DRIFT = 10.0
 #: Names of the bounds at which a pole pair follows an oscillation of this record's noise.

@@ -81,7 +81,7 @@ def parameter_change(
 ) -> ParameterChange | None:
     """Return a change of the parameters that all records have in common; None if none is significant.
 
-    The sensitivities psi of each record, shape (count, f), are along the f free directions of the parameters; ``common``
+    The sensitivities psi of each record, shape (count, f), are along the free directions of the parameters; ``common``
     is the mask of those that change common ones. One of the quantities is named.
     """
     sizes, several = [len(block) for block in psi], len(psi) > 1
