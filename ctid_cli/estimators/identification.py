@@ -354,7 +354,7 @@ def identify(
     each = {hold: replace(options, covariance="white").prepare(one) for hold, one in versions.items()}
     fit: MeasuredFit | SubmodelsFit | LoopFit = of_best_hold({hold: one.minimum() for hold, one in each.items()})
     hold = fit.assumed_hold and fit.assumed_hold.hold
-    prepared, records = each[hold], versions[hold]
+    prepared, records = each[hold], [with_hold(one, one.hold) for one in versions[hold]]
     if validation is not None and validation.hold_assumed:
         validation = with_hold(validation, records[0].hold)
         checked = laid_out_validation(options, validation)
