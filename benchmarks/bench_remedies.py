@@ -16,8 +16,8 @@ import numpy as np
 
 from ctid_cli import DelayProfile, HeldSignal, Record, TransferFunction, read_record, simulate
 from ctid_cli.errors import CtidError
-from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.remedies import tried_remedies
+from ctid_cli.signals.record import with_hold
 
 FAULTS = ("poles", "delay", "integrator", "outliers")
 #: Options that remove a fault.

@@ -157,7 +157,7 @@ def _fit_of_records(
         raise UsageError(f"{len(files)} files are given, and {what}; give one file")
     if loop.unstable and (assessment.predict or 1) > 1:
         raise UsageError("--predict must be 1 for a plant that may be unstable: later outputs are not predicted")
-    hold = "zoh" if request.hold == "auto" else request.hold
+    hold = None if request.hold == "auto" else request.hold
     records = columns.read_all(files, assessment.validate, hold, reference=loop.reference).treated(loop.applied)
     if request.single and request.options.common("delay_bounds") is None:
         records = records.treated(without_delay)

@@ -17,8 +17,9 @@ from ctid_cli.filtering.bank import Equations
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_dispersion
 from ctid_cli.inference.criteria import percent_from_r_squared
-from ctid_cli.inference.fit import Fit, IterationRecord, Status
+from ctid_cli.inference.fit import AssumedHold, Fit, IterationRecord, Status
 from ctid_cli.inference.noise_estimate import orders_of
+from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty, estimate_uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
@@ -30,7 +31,8 @@ from ctid_cli.signals.checks import (
     require_not_negative,
     require_positive,
 )
-from ctid_cli.signals.record import Record, as_records, named
+from ctid_cli.signals.record import Record, as_records, named, with_hold
+from ctid_cli.signals.treatment import Hold, Holds
 from ctid_cli.text import listed
 
 
@@ -176,9 +178,47 @@ class Estimator(Generic[LaidOut, AnyFit]):
     def fit(self, record: Any, start: Start | None = None) -> AnyFit:
         """Estimate from a record, or several if allowed, and from a start if the estimator uses one.
 
-        A DataError states why estimation is impossible.
+        A DataError states why estimation is impossible. A smooth input whose hold is not given is taken as ``zoh`` or
+        ``foh``, whichever fits better.
         """
-        return self.prepare(record).fit(start)
+        tried = {hold: self.prepare(one).fit(start) for hold, one in assumed_holds(record).items()}
+        found = of_best_hold(tried)
+        return found._joined([tried[hold] for hold in found.assumed_hold.others]) if found.assumed_hold else found
+
+
+def assumed_holds(record: Any) -> dict[Holds | None, Any]:
+    """Return a record, or several, with each hold that smooth inputs without a given hold may have.
+
+    The only key is None if all holds are given, all such inputs change in steps, or the record is from a loop.
+    """
+    several = [record] if isinstance(record, Record) else as_records(record) if isinstance(record, Sequence) else []
+    if not any(one.hold_assumed for one in several) or any(one.in_loop for one in several):
+        return {None: record}
+    names = [
+        name
+        for name, signal in several[0].held.items()
+        if signal.assumed and all(input_moves(one.of_input(name)).kind == "continuous" for one in several)
+    ]
+    found: dict[Holds | None, Any] = {}
+    regular = all(one.interval is not None for one in several)
+    for hold in get_args(Hold) if names else ():
+        if hold == "band-limited" and not regular:
+            continue
+        each = tuple(hold if name in names else signal.hold for name, signal in several[0].held.items())
+        own: Holds = hold if len(set(each)) == 1 else each
+        versions = [with_hold(one, own) for one in several]
+        found[own] = versions[0] if isinstance(record, Record) else versions
+    return found or {None: record}
+
+
+def of_best_hold(tried: Mapping[Holds | None, AnyFit]) -> AnyFit:
+    """Return the fit with the least error, and holds of the input that fit as well."""
+    finite = {hold: fit for hold, fit in tried.items() if np.isfinite(fit._misfit)} or tried
+    best, fit = min(finite.items(), key=lambda each: each[1]._misfit)
+    if best is None:
+        return fit
+    likely = tuple(hold for hold, other in finite.items() if hold not in (None, best) and other._is_likely_as(fit))
+    return replace(fit, assumed_hold=AssumedHold(best, likely))
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,7 +49,7 @@ class AdditiveFit(Fit):
     ----------
     model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number, history
         As in :class:`~ctid_cli.inference.fit.Fit`.
-    law, in_ignored_loop
+    law, in_ignored_loop, assumed_hold
         As in :class:`~ctid_cli.inference.fit.Fit`.
     additive : AdditiveModel
         Estimated sum, sorted by natural frequency. ``model`` is the equivalent single transfer function, and

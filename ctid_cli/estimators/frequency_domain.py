@@ -47,7 +47,7 @@ class FrequencyDomainFit(MeasuredFit):
         then the imaginary parts.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
-    equivalents, undetermined, intervals, other_minima, rounding
+    equivalents, undetermined, intervals, other_minima, rounding, change, assumed_hold
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     data : FrequencyData
         Frequency response.
@@ -91,6 +91,9 @@ class FrequencyDomainFit(MeasuredFit):
         leverage = np.einsum("ki,ij,kj->k", scaled, inverse[0], scaled)
         weighed = scaled * (e / np.sqrt(np.maximum(1.0 - leverage, 1e-12)))[:, None]
         return Uncertainty.of("white", self.tangent, Dispersion.scaled(sandwich(*inverse, weighed.T @ weighed), spare))
+
+    def _change(self) -> None:
+        """Return None: a frequency response has no halves in time."""
 
     @property
     def correlated(self) -> bool:
@@ -166,7 +169,7 @@ class FrequencyDomainSumFit(FrequencyDomainFit, SubmodelsFit):
         As in :class:`FrequencyDomainFit`.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`FrequencyDomainFit`.
-    equivalents, undetermined, intervals, other_minima, rounding
+    equivalents, undetermined, intervals, other_minima, rounding, change, assumed_hold
         As in :class:`FrequencyDomainFit`.
     additive, start_method, loop_radius, in_loop, consistency, sampling, two_stage
         As in :class:`~ctid_cli.estimators.measured_submodels.SubmodelsFit`; only the first two apply.

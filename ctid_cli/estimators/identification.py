@@ -9,6 +9,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
+from ctid_cli.estimation.common import assumed_holds, of_best_hold
 from ctid_cli.estimation.delay_search import quarter_periods
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import part_of
@@ -35,7 +36,7 @@ from ctid_cli.estimators.reported_parameters import (
 from ctid_cli.estimators.rivc import Rivc
 from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.criteria import fit_percent, r_squared
-from ctid_cli.inference.fit import DeferredFields, InputFit
+from ctid_cli.inference.fit import DeferredFields, Fit, InputFit
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.input_response import output_bandwidth
@@ -50,7 +51,7 @@ from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.processors import one_thread
 from ctid_cli.progress import reported
 from ctid_cli.signals.checks import require_integer
-from ctid_cli.signals.record import Record, common_samples
+from ctid_cli.signals.record import Record, common_samples, with_hold
 from ctid_cli.text import Shown, listed
 
 #: Estimators of measured records, and their prepared records.
@@ -208,7 +209,12 @@ class Identification(DeferredFields, FittedModel, Shown):
         DataError
             If the record cannot be used.
         """
+        record = self._as_held(record)
         return validated(self.options._applied(self.fit, laid_out_validation(self.options, record)), record)
+
+    def _as_held(self, record: Record) -> Record:
+        """Return another record with the hold of those of the estimation, unless its own is given."""
+        return with_hold(record, self.records[0].hold) if record.hold_assumed else record
 
     @property
     def uncertainty(self) -> Uncertainty:
@@ -283,7 +289,7 @@ class Identification(DeferredFields, FittedModel, Shown):
         require_integer("ahead", ahead, 1)
         if ahead > 1 and isinstance(self.fit, LoopFit) and self.fit.in_ignored_loop:
             raise DataError("a plant that may be unstable is predicted one sample ahead only")
-        applied = self.options._applied(self.fit, self.options.prepare(record).laid_out)
+        applied = self.options._applied(self.fit, self.options.prepare(self._as_held(record)).laid_out)
         (use,), errors, found = applied.used, applied.residuals, np.full(record.n_samples, np.nan)
         left = errors if self.fit.noise is None else self.fit.noise.prediction_errors(errors, applied.used, ahead)
         found[use] = record.y[use] - left[0]
@@ -349,8 +355,14 @@ def identify(
     # Check the validation record before the fit, which takes longer.
     checked = None if validation is None else laid_out_validation(options, validation)
     # Errors for coloured noise are computed once, below, where a bootstrap can report its progress.
-    prepared = replace(options, covariance="white").prepare(records)
-    fit: MeasuredFit | SubmodelsFit | LoopFit = prepared.minimum()
+    versions: dict[Any, Sequence[Record]] = assumed_holds(records)
+    each = {hold: replace(options, covariance="white").prepare(one) for hold, one in versions.items()}
+    fit: MeasuredFit | SubmodelsFit | LoopFit = of_best_hold({hold: one.minimum() for hold, one in each.items()})
+    hold = fit.assumed_hold and fit.assumed_hold.hold
+    prepared, records = each[hold], [with_hold(one, one.hold) for one in versions[hold]]
+    if validation is not None and validation.hold_assumed:
+        validation = with_hold(validation, records[0].hold)
+        checked = laid_out_validation(options, validation)
     uncertainty = fit.uncertainty(covariance, bootstrap_draws, progress)
     fit = fit._with_law(uncertainty)
     measured: Any = prepared.laid_out
@@ -386,6 +398,7 @@ def identify(
         warnings=(),
         validation=validated_on,
         records=tuple(records),
+        choices=tuple(Fit.marks(fit)),
     )
 
 

@@ -63,7 +63,7 @@ class LoopFit(MeasuredFit):
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
-    equivalents, undetermined, intervals, other_minima, rounding
+    equivalents, undetermined, intervals, other_minima, rounding, change, assumed_hold
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     loop_radius : float
         Largest magnitude of the poles of the loop with the controller over one sampling interval [-].

@@ -23,16 +23,19 @@ from ctid_cli.estimation.parameter_layout import Degrees, Layout
 from ctid_cli.estimation.robust_fit import RobustFit
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.inference.covariance import Rounding, condition_number
-from ctid_cli.inference.criteria import percent_from_r_squared
+from ctid_cli.inference.criteria import HOLD_REJECTED, percent_from_r_squared, squared_innovations
 from ctid_cli.inference.fit import DeferredFields, Fit, InputFit, Status
 from ctid_cli.inference.innovations import NoiseFit, restricted_dispersion, steps_of
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_covariance, orders_of
+from ctid_cli.inference.noise_model import fit_noise_model
+from ctid_cli.inference.parameter_change import ParameterChange, Quantity, parameter_change
 from ctid_cli.inference.repetition import Equivalent
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
+from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAW, DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.factoring import section_basis, section_slopes
-from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of
+from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of, is_delay
 from ctid_cli.progress import calling
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.text import listed
@@ -58,7 +61,7 @@ class MeasuredFit(DeferredFields, Fit):
 
     Parameters
     ----------
-    model, parameter_names, covariance, status, r2, count, condition_number, law, in_ignored_loop
+    model, parameter_names, covariance, status, r2, count, condition_number, law, in_ignored_loop, assumed_hold
         As in :class:`~ctid_cli.inference.fit.Fit`.
     cost : float
         Mean squared output error over the used samples, or twice the mean of another loss [output unit^2].
@@ -110,6 +113,8 @@ class MeasuredFit(DeferredFields, Fit):
         Starts of further minima of the search that are nearly as low.
     rounding : tuple of Rounding or None
         Step and fitted output of each record whose output is coarsely rounded, else None.
+    change : ParameterChange or None
+        Different parameters of the halves of a record, or of several records; None if equal ones are not rejected.
     """
 
     deferred: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used", "rounding")
@@ -137,6 +142,7 @@ class MeasuredFit(DeferredFields, Fit):
     intervals: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
     other_minima: tuple[Begin, ...] = ()
     rounding: tuple[Rounding | None, ...] = field(default_factory=tuple)
+    change: ParameterChange | None = None
 
     @property
     def standard_errors(self) -> dict[str, float]:
@@ -148,7 +154,7 @@ class MeasuredFit(DeferredFields, Fit):
         return found | dict.fromkeys(self.undetermined, np.nan)
 
     def marks(self, time_unit: str = "s") -> list[str]:
-        """Return what the records do not determine, and what a repeating input cannot tell apart, in sentences.
+        """Return what the records do not determine or do not agree on, and what a repeating input cannot tell apart.
 
         Parameters
         ----------
@@ -160,11 +166,12 @@ class MeasuredFit(DeferredFields, Fit):
         list of str
             One sentence for each; empty if there is nothing to say.
         """
-        found = self._repeating(time_unit)
+        found = super().marks(time_unit) + self._repeating(time_unit)
         if self.undetermined:
             found.append(f"Not determined: {listed(self.undetermined)}.")
         each = ((name, pieces) for name, pieces in self.intervals.items() if len(pieces) > 1)
-        return found + [several_intervals(name, pieces) for name, pieces in each]
+        found += [several_intervals(name, pieces) for name, pieces in each]
+        return found + ([] if self.change is None else [f"{self.change.sentence}."])
 
     def _repeating(self, time_unit: str) -> list[str]:
         """Return the models that a repeating input cannot tell apart, in sentences."""
@@ -220,7 +227,60 @@ class MeasuredFit(DeferredFields, Fit):
         """Return the fit with its uncertainty; singular if it converged but has no covariance."""
         undefined = law.kind != "biased" and not law.defined
         singular = self.status is Status.CONVERGED and undefined
-        return replace(self, covariance=law.covariance, law=law, status=Status.SINGULAR if singular else self.status)
+        status, change = Status.SINGULAR if singular else self.status, None if law.kind == "biased" else self._change()
+        return replace(self, covariance=law.covariance, law=law, status=status, change=change)
+
+    @property
+    def _misfit(self) -> float:
+        """Mean loss, or with a noise model the geometric mean of the variance of its innovations."""
+        return self.cost if self.noise is None else float(np.exp(self.noise.deviance / self.count))
+
+    def _is_likely_as(self, best: Self) -> bool:
+        """Return whether the data do not reject this fit against a better one, in noise of its colour."""
+        linear = self.linear, best.linear
+        noise = fit_noise_model(linear[1].residuals, penalty=float(np.log(best.count)))
+        own, least = (
+            squared_innovations(each.residuals, [psi @ each.tangent for psi in each.sensitivities], noise)
+            for each in linear
+        )
+        return best.count * np.log(own / least) <= HOLD_REJECTED if least > 0.0 else False
+
+    def _joined(self, others: Sequence[Self]) -> Self:
+        """Return the fit with intervals of the delays that contain those of other fits."""
+        found = dict(self.intervals)
+        for name in delay_names(self):
+            pieces = [pair for fit in (self, *others) for pair in fit._intervals_of(name)]
+            if pieces and np.isfinite(pieces).all():
+                found[name] = ((max(min(low for low, _ in pieces), 0.0), max(high for _, high in pieces)),)
+        return replace(self, intervals=found)
+
+    def _intervals_of(self, name: str) -> tuple[tuple[float, float], ...]:
+        """Return the 95 % intervals of a parameter; none if it is not estimated."""
+        if name not in self.parameter_names or name in self.intervals:
+            return self.intervals.get(name, ())
+        value, reach = self.parameters[name], self.quantiles[name] * self.standard_errors[name]
+        return ((value - reach, value + reach),)
+
+    def _change(self) -> ParameterChange | None:
+        """Return a change of the parameters between the halves of a record, or between records."""
+        linear, tangent = self.linear, self.tangent
+        shared = np.array([re.fullmatch(r"(.+_)?([ab]\d+|delay)", name) is not None for name in self.parameter_names])
+        slopes = [psi @ tangent for psi in linear.sensitivities]
+        return parameter_change(slopes, linear.residuals, tangent[shared].any(axis=0), self._quantities)
+
+    def _quantities(self) -> list[Quantity]:
+        """Return the static gains and the common parameters with their derivatives along the free directions."""
+        parts = self.model.parts if isinstance(self.model, MultiInputModel) else {"": self.parametrised}
+        found = []
+        for name, part in parts.items():
+            own = (each.removeprefix(f"{name}_") if name else each for each in self.parameter_names)
+            bare = tuple(each if re.fullmatch(r"(g\d+_)?[ab]\d+|delay", each) else f"other {each}" for each in own)
+            gain, slopes = float(part.dc_gain), Parametric(part, bare)
+            if np.isfinite(gain):
+                by_theta = slopes.frequency_slopes(np.zeros(1))[0].real
+                found.append(Quantity(f"{name} static gain".lstrip(), gain, by_theta @ self.tangent, True))
+        each = zip(self.parameter_names, self.theta.tolist(), self.tangent, strict=True)
+        return found + [Quantity(*one, is_delay(one[0])) for one in each]
 
     @property
     def signs_known(self) -> bool:
@@ -296,7 +356,7 @@ class MultiInputFit(MeasuredFit):
         As in :class:`MeasuredFit`; ``input_offsets`` has those of all inputs, record by record.
     poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met, equivalents, undetermined
         As in :class:`MeasuredFit`.
-    intervals, other_minima, rounding
+    intervals, other_minima, rounding, change, assumed_hold
         As in :class:`MeasuredFit`.
     """
 

@@ -40,7 +40,7 @@ class SubmodelsFit(MeasuredFit):
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
-    equivalents, undetermined, intervals, other_minima, rounding
+    equivalents, undetermined, intervals, other_minima, rounding, change, assumed_hold
         As in :class:`~ctid_cli.estimators.measured_fit.MeasuredFit`.
     additive : AdditiveModel or None
         Submodels; None for a single transfer function.

@@ -13,12 +13,13 @@ from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.estimators.measured_fit import MultiInputFit
 from ctid_cli.inference.criteria import fit_percent, r_squared
+from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.sensitivities import Parametric, Structure
 from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.processors import one_thread
-from ctid_cli.signals.record import Record, named
+from ctid_cli.signals.record import Record, named, with_hold
 from ctid_cli.signals.treatment import InitialState, Offset
 
 
@@ -127,6 +128,10 @@ class _Applied(NamedTuple):
 
 def _applied(fit: FittedModel, record: Record, initial_state: InitialState | None, offset: Offset | None) -> _Applied:
     """Apply a model to a record, with the given treatment or that of its estimation."""
+    if isinstance(fit, Identification):
+        record = fit._as_held(record)
+    elif record.hold_assumed and isinstance(fit, Fit) and fit.assumed_hold is not None:
+        record = with_hold(record, fit.assumed_hold.hold)
     own: tuple[InitialState, Offset] = "rest", "none"
     if isinstance(fit, Identification):
         own = fit.options.initial_state, fit.options.offset

@@ -45,7 +45,7 @@ class RedundantFit(Fit):
     ----------
     model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number, history
         As in :class:`~ctid_cli.inference.fit.Fit`.
-    law, in_ignored_loop
+    law, in_ignored_loop, assumed_hold
         As in :class:`~ctid_cli.inference.fit.Fit`.
     search : RedundantMinimum or None
         Incumbents, candidates and switches: points are delays [s], costs are J0 [%].

@@ -22,8 +22,7 @@ from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking, Searc
 from ctid_cli.models.additive import Term
 from ctid_cli.models.several_inputs import AnyModel, delays_of
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import Record, named
+from ctid_cli.signals.record import Record, named, with_hold
 from ctid_cli.signals.treatment import Holds, InitialState, InputBefore, Offset
 
 #: Most poles, integrators included.
@@ -102,15 +101,6 @@ class Span(NamedTuple):
         found = [(n, each) for n in orders for each in self.structures(n, integrators, delay_free)]
         small = [each for n, each in found if (n, each[1]) in SMALL[:most]]
         return small or [each for _, each in found[:1]]
-
-
-def with_hold(record: Record, hold: Holds) -> Record:
-    """Return a record with another hold of its inputs."""
-    if record.hold == hold:
-        return record
-    holds = [hold] * len(record.held) if isinstance(hold, str) else hold
-    each = zip(record.held.items(), holds, strict=True)
-    return replace(record, inputs={name: HeldSignal(one.t, one.values, own) for (name, one), own in each})
 
 
 @dataclass(frozen=True, eq=False)

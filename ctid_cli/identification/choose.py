@@ -24,7 +24,6 @@ from ctid_cli.identification.candidates import (
     SmallModels,
     Span,
     grid,
-    with_hold,
     zero_on_integrator,
 )
 from ctid_cli.identification.choice import Choice, Given
@@ -58,7 +57,7 @@ from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.processors import one_thread
 from ctid_cli.progress import reported
 from ctid_cli.signals.held import Hold
-from ctid_cli.signals.record import Record, as_records
+from ctid_cli.signals.record import Record, as_records, with_hold
 from ctid_cli.signals.treatment import Holds
 
 #: The range of the delay ends at this multiple of the delay of a small model, plus this number of sampling intervals:

@@ -1,5 +1,6 @@
 """Intervals after a choice of the structure."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +11,11 @@ from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.measured_fit import fitted
 from ctid_cli.estimators.reported_parameters import determined, reported_parameters
-from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.choice import Choice
 from ctid_cli.identification.criterion import Candidate
 from ctid_cli.inference.intervals import NOT_DETERMINED, UncertainValue
+from ctid_cli.signals.record import with_hold
+from ctid_cli.signals.treatment import Holds
 
 #: Quantities that a missing pole biases.
 BIASED_BY_A_POLE = "delay", "static_gain"
@@ -26,15 +28,16 @@ JOINED = (
 JOINED_HOLDS = "Intervals of the delay and the static gain are joined with those for --hold {}, which fits as well."
 
 
-def joined_with_holds(found: Identification, choice: Choice) -> Identification:
+def joined_with_holds(found: Identification, holds: Sequence[Holds]) -> Identification:
     """Return a fit whose intervals of the delay and the gain contain those of other holds that fit as well.
 
     A signal of straight lines leads that of constant values by half a sampling interval.
     """
-    options = choice.options
-    for hold in choice.holds if isinstance(options, DelayProfile) and not options.bounds else ():
-        laid_out = options.prepare([with_hold(record, hold) for record in choice.records]).laid_out
+    options = found.options
+    for hold in holds if isinstance(options, DelayProfile) and not options.bounds else ():
+        laid_out = options.prepare([with_hold(record, hold) for record in found.records]).laid_out
         text = JOINED_HOLDS.format(hold if isinstance(hold, str) else ", ".join(hold))
+        assert isinstance(laid_out, MeasuredRecords)
         found = _joined_with(found, laid_out, laid_out.local(laid_out.begin(found.fit.model)), text)
     return found
 

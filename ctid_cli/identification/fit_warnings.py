@@ -89,7 +89,8 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[str]:
             *of_search(fit, time_unit),
             *_of_uncertainty(found, time_unit),
         ]
-    return list(dict.fromkeys([*_of_validation(found), *named, *others]))[:MOST]
+    changed = [] if fit.change is None else [fit.change.sentence]
+    return list(dict.fromkeys([*_of_validation(found), *named, *changed, *others]))[:MOST]
 
 
 def _used(found: Identification) -> Iterator[tuple[Record, BoolArray]]:

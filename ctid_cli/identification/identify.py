@@ -7,7 +7,6 @@ from typing import get_args
 from ctid_cli.errors import DataError
 from ctid_cli.estimators import identification
 from ctid_cli.estimators.identification import Identification, Options
-from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.choose import choose
 from ctid_cli.identification.chosen_intervals import joined_with_holds, joined_with_larger, with_other_gains
@@ -15,7 +14,7 @@ from ctid_cli.identification.fit_warnings import with_warnings
 from ctid_cli.identification.validation import laid_out_for, validated_on
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress
 from ctid_cli.processors import one_thread
-from ctid_cli.signals.record import Record, as_records
+from ctid_cli.signals.record import Record, as_records, with_hold
 from ctid_cli.text import listed
 
 
@@ -87,7 +86,9 @@ def identify(
         raise TypeError(f"{what}, not {type(options).__name__}; any estimator fits by itself: estimator.fit(record)")
     noise = covariance, bootstrap_draws, progress
     if options is not None and not isinstance(options, Given):
-        return with_warnings(identification.identify(options, several, validation, *noise), time_unit)
+        found = identification.identify(options, several, validation, *noise)
+        likely = found.fit.assumed_hold.others if found.fit.assumed_hold else ()
+        return with_warnings(joined_with_holds(found, likely), time_unit)
     given = options or Given()
     choice = choose(several, given, time_unit)
     if given.poles is None and not choice.has_model:
@@ -102,7 +103,7 @@ def identify(
         laid_out_for(other, choice.options, given)
     found = identification.identify(choice.options, choice.records, None, *noise)
     found = replace(found, choices=choice.sentences)
-    found = joined_with_holds(with_other_gains(found, choice), choice)
+    found = joined_with_holds(with_other_gains(found, choice), choice.holds)
     if not (given.typed or (isinstance(given.poles, int) and isinstance(given.zeros, int))):
         found = joined_with_larger(found, choice)
     if other is not None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from ctid_cli.estimation.optimum.best_model import most_active
 from ctid_cli.estimation.record_preparation import part_of_record, period_of
-from ctid_cli.identification.candidates import Setting, with_hold
+from ctid_cli.identification.candidates import Setting
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import Candidate
 from ctid_cli.inference.input_response import analyse_response
@@ -17,7 +17,7 @@ from ctid_cli.inference.residual_tests import chi_square_tail
 from ctid_cli.inference.signal_features import FEW_CHANGES, input_moves
 from ctid_cli.models.several_inputs import AnyModel, fractions_of
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import Record, beginning
+from ctid_cli.signals.record import Record, beginning, with_hold
 from ctid_cli.signals.treatment import InitialState, InputBefore
 
 #: Share of its range that the input must cross after the greatest delay, so that an estimated state leaves the gain

@@ -13,13 +13,12 @@ from ctid_cli.errors import CtidError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Options
 from ctid_cli.estimators.measured_fit import MeasuredFit
-from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.changes import CHANGES, Change, FittedOptions, Kind, option_of
 from ctid_cli.identification.criterion import Errors, criteria_of
 from ctid_cli.identification.held_back import compared, long_enough
 from ctid_cli.inference.signal_features import residual_outliers
 from ctid_cli.progress import reported
-from ctid_cli.signals.record import Record, beginning
+from ctid_cli.signals.record import Record, beginning, with_hold
 from ctid_cli.signals.treatment import Holds
 
 #: Most samples of all records of one input on which changes are tried.

@@ -7,14 +7,13 @@ import numpy as np
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimators.identification import Validation, laid_out_validation, tests_of, validated
 from ctid_cli.estimators.measured_fit import MeasuredFit
-from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Candidate, Errors, Searched, criteria_of
 from ctid_cli.identification.initial_states import states_of
 from ctid_cli.inference import criteria
 from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.progress import reported
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, with_hold
 from ctid_cli.signals.treatment import Offset
 
 

@@ -117,6 +117,9 @@ def young_information_criterion(residuals: Array, output: Array, estimates: Arra
 
 #: Directions of the sensitivities with less than this share of the greatest singular value are ignored.
 RANK = 1e-9
+#: Increase of twice the negative log-likelihood up to which a hold of the input is not rejected. That of the true hold
+#: beside a wrong one is normal with the mean -d and the variance 4 d, so that it exceeds 6.63 in at most .5 %.
+HOLD_REJECTED = 6.63
 #: Number of blocks of each record for cross-validation.
 BLOCKS = 10
 #: Largest share of the information on a direction that may come from the omitted block.

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -17,7 +17,8 @@ from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.text import Shown, wrapped
+from ctid_cli.signals.treatment import Holds
+from ctid_cli.text import Shown, listed, wrapped
 
 #: Names of the parameters of one transfer function.
 _OF_INPUT = r"[ab]\d+|delay"
@@ -87,6 +88,24 @@ class DeferredFields:
             return self.__dict__[name]
 
 
+class AssumedHold(NamedTuple):
+    """Hold of a smooth input whose hold was not given."""
+
+    hold: Holds
+    #: Other holds that fit as well.
+    others: tuple[Holds, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """What was taken, and why; empty if constant values between the samples fit clearly best."""
+        best, *likely = (each if isinstance(each, str) else ", ".join(each) for each in (self.hold, *self.others))
+        start = f"The hold of the input was not given: {best} fits"
+        if likely:
+            joined = f"and {listed(likely)} not clearly worse; the interval of the delay contains those for all of them"
+            return f"{start} best, {joined}. Give the hold."
+        return "" if best == "zoh" else f"{start} best. Give the hold."
+
+
 @dataclass(frozen=True)
 class IterationRecord:
     """One accepted iteration."""
@@ -133,6 +152,8 @@ class Fit(FittedModel, Shown):
         Distribution of the estimates: covariance formula and quantiles; None for the normal distribution.
     in_ignored_loop : bool, default False
         Whether the input responds to the output through a loop that the estimator ignores.
+    assumed_hold : AssumedHold, optional
+        Hold of a smooth input whose hold was not given; None if it was given.
     """
 
     model: TransferFunction
@@ -148,12 +169,41 @@ class Fit(FittedModel, Shown):
     history: Sequence[IterationRecord] = ()
     law: Uncertainty | None = None
     in_ignored_loop: bool = False
+    assumed_hold: AssumedHold | None = None
 
     def __repr__(self) -> str:
         errors = self.standard_errors
         listed = ", ".join(f"{name} = {value:.6g} ± {errors[name]:.2g}" for name, value in self.parameters.items())
         head = f"{type(self).__name__}: {self.status.name}, fit {self.fit_percent:.5g} % of {self.count} samples"
         return f"{head}\n{wrapped(listed, '  ')}"
+
+    def marks(self, time_unit: str = "s") -> list[str]:
+        """Return what is to be known of the estimate, in sentences.
+
+        Parameters
+        ----------
+        time_unit : str, default "s"
+            Unit of time of the records.
+
+        Returns
+        -------
+        list of str
+            One sentence for each; empty if there is nothing to say.
+        """
+        return [self.assumed_hold.sentence] if self.assumed_hold is not None and self.assumed_hold.sentence else []
+
+    @property
+    def _misfit(self) -> float:
+        """Measure of the error of this fit, with which fits of the same samples are compared."""
+        return self.cost
+
+    def _is_likely_as(self, best: Self) -> bool:
+        """Return whether the data do not reject this fit against a better one; without residuals they do."""
+        return False
+
+    def _joined(self, others: Sequence[Self]) -> Self:
+        """Return the fit with intervals of the delay that contain those of other fits."""
+        return self
 
     @property
     def parameters(self) -> dict[str, float]:

@@ -49,6 +49,8 @@ class HeldSignal:
         ``zoh`` keeps each value until the next break; ``foh`` joins the values by straight lines; ``band-limited``
         has no power above half the sampling frequency, as signals behind an anti-alias filter, and needs a regular
         clock. After the last break all keep the last value.
+    assumed : bool, default False
+        Whether the hold was not given: estimators compare a smooth signal as ``zoh`` and as ``foh``.
 
     Raises
     ------
@@ -60,6 +62,7 @@ class HeldSignal:
     t: Array
     values: Array
     hold: Hold = "zoh"
+    assumed: bool = False
 
     def __post_init__(self) -> None:
         t = np.array(self.t, dtype=float)

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -68,7 +68,7 @@ def read_record(
     time: str = "t",
     input: str = "u",
     output: str = "y",
-    hold: Hold = "zoh",
+    hold: Hold | None = None,
     offset: Offset = "none",
 ) -> Record:
     """Read a record from a file with one line per instant.
@@ -83,8 +83,8 @@ def read_record(
         Column of the input [input unit].
     output : str, default "y"
         Column of the output [output unit]; an empty field or NaN is a missing sample.
-    hold : {"zoh", "foh", "band-limited"}, default "zoh"
-        Interpolation of the input between its samples.
+    hold : {"zoh", "foh", "band-limited"}, optional
+        Interpolation of the input between its samples; as in :meth:`Record.from_arrays` if it is not given.
     offset : {"none", "remove"}, default "none"
         ``remove`` subtracts the means of the input and of the present output samples.
 
@@ -103,7 +103,7 @@ def read_record(
     if offset == "none":
         return record
     u, y = record.input.values, record.y
-    return Record(record.t, y - np.nanmean(y), HeldSignal(record.t, u - u.mean(), hold), name=record.name)
+    return Record(record.t, y - np.nanmean(y), replace(record.input, values=u - u.mean()), name=record.name)
 
 
 def read_measurement(
@@ -112,7 +112,7 @@ def read_measurement(
     time: str | None = None,
     input: str | Sequence[str] | None = None,
     output: str | None = None,
-    hold: Hold | Sequence[Hold] = "zoh",
+    hold: Hold | Sequence[Hold] | None = None,
     start: float | None = None,
     stop: float | None = None,
     reference: str | None = None,
@@ -126,7 +126,7 @@ def read_measurement(
     holds.
     """
     several = [input] if input is None or isinstance(input, str) else list(input)
-    holds = [hold] * len(several) if isinstance(hold, str) else hold
+    holds = [hold or "zoh"] * len(several) if isinstance(hold, str | None) else hold
     for one in holds:
         require_choice("hold", one, get_args(Hold))
     roles = ["input", *(f"input {k}" for k in range(2, len(several) + 1))]
@@ -142,7 +142,7 @@ def read_measurement(
     if len(set(names)) < len(names):
         raise DataError(f"{file}: each input needs a name of its own; these are {', '.join(names)}")
     inputs: dict[str, Any] = {
-        name: HeldSignal(t[used], columns.input(used, role), own)
+        name: HeldSignal(t[used], columns.input(used, role), own, assumed=hold is None)
         for name, role, own in zip(names, roles, holds, strict=True)
     }
     only_one = len(inputs) == 1

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import freeze, require_choice
 from ctid_cli.signals.data_checks import Rows, check_input, check_output, check_times
@@ -19,6 +20,9 @@ from ctid_cli.signals.treatment import Holds
 
 #: Where the reference enters a loop.
 Enters = Literal["controller", "input"]
+#: Records of different lengths overlap if all samples at common instants agree and the output changes this many times
+#: among them: outputs at rest or in coarse steps agree by chance.
+FEW_CHANGES = 20
 
 
 class Controller(Protocol):
@@ -87,7 +91,7 @@ class Record:
         Output samples [output unit]; a NaN is a masked (missing) sample.
     inputs : HeldSignal, or mapping of names to HeldSignal or array_like
         The input on its own break times [s]; or several inputs by name. Values without times belong to the instants of
-        the output, each held until the next one (zoh).
+        the output; their hold is not given, as with :meth:`from_arrays`.
     noise_free : ndarray, shape (N,), optional
         The output without noise [output unit], known only for simulated records.
     name : str, default ""
@@ -157,7 +161,7 @@ class Record:
             raise DataError(f"{where}in a closed loop {what}; give its values at the samples")
 
     @classmethod
-    def from_arrays(cls, t: ArrayLike, u: ArrayLike, y: ArrayLike, hold: Hold = "zoh", name: str = "") -> Record:
+    def from_arrays(cls, t: ArrayLike, u: ArrayLike, y: ArrayLike, hold: Hold | None = None, name: str = "") -> Record:
         """Make a record whose input is given at the instants of the output.
 
         Parameters
@@ -168,8 +172,9 @@ class Record:
             Input samples [input unit].
         y : array_like, shape (N,)
             Output samples [output unit]; NaN marks a missing sample.
-        hold : {"zoh", "foh", "band-limited"}, default "zoh"
-            Interpolation of the input between its samples.
+        hold : {"zoh", "foh", "band-limited"}, optional
+            Interpolation of the input between its samples. If it is not given, an input that changes in steps is
+            ``zoh``; of a smooth one, estimators take ``zoh`` or ``foh``, whichever fits better, and say so.
         name : str, default ""
             Name in messages.
 
@@ -179,7 +184,8 @@ class Record:
             The record.
         """
         times = np.asarray(t, dtype=float)
-        return cls(times, np.asarray(y, dtype=float), HeldSignal(times, np.asarray(u, dtype=float), hold), name=name)
+        signal = HeldSignal(times, np.asarray(u, dtype=float), hold or "zoh", assumed=hold is None)
+        return cls(times, np.asarray(y, dtype=float), signal, name=name)
 
     @property
     def held(self) -> dict[str, HeldSignal]:
@@ -217,6 +223,11 @@ class Record:
         """Hold of the inputs; a tuple if they differ."""
         each = tuple(signal.hold for signal in self.held.values())
         return each[0] if len(set(each)) == 1 else each
+
+    @property
+    def hold_assumed(self) -> bool:
+        """Whether the hold of an input was not given."""
+        return any(signal.assumed for signal in self.held.values())
 
     @property
     def hold_options(self) -> list[str]:
@@ -296,13 +307,65 @@ def beginning(record: Record, samples: int) -> Record:
     return Record(t, record.y[:samples], inputs, name=record.name)
 
 
+def with_hold(record: Record, hold: Holds) -> Record:
+    """Return a record with a given hold of its inputs."""
+    if record.hold == hold and not record.hold_assumed:
+        return record
+    holds = [hold] * len(record.held) if isinstance(hold, str) else hold
+    each = zip(record.held.items(), holds, strict=True)
+    return replace(record, inputs={name: HeldSignal(one.t, one.values, own) for (name, one), own in each})
+
+
 def common_samples(record: Record, others: Sequence[Record]) -> int:
-    """Return how many samples of a record are those of others, with which it agrees at all instants they share."""
-    found = 0
-    for other in others:
-        _, own, theirs = np.intersect1d(record.t, other.t, assume_unique=True, return_indices=True)
-        found += own.size * np.array_equal(record.y[own], other.y[theirs], equal_nan=True)
+    """Return how many samples of a record others have too, perhaps with times shifted by a constant."""
+    return sum(_shared(record, other) for other in others)
+
+
+def _shared(one: Record, other: Record) -> int:
+    """Return the number of common samples of two records that are copies of each other or overlap; 0 for others."""
+    at_start = float(other.t[0] - one.t[0])
+    few = slice(None, None, max(one.n_samples // FEW_CHANGES, 1))
+    for shift in dict.fromkeys([0.0, at_start, *_shifts(one, other), *(-each for each in _shifts(other, one))]):
+        # Most records differ at the first samples that are compared.
+        for part in few, slice(None):
+            own, theirs = _at_same_times(one.t[part] + shift, other.t)
+            y, equal = one.y[part][own], other.y[theirs]
+            if not np.array_equal(y, equal, equal_nan=True):
+                break
+        else:
+            whole = own.size == one.n_samples == other.n_samples
+            changes = np.count_nonzero(np.diff(y[np.isfinite(y)]))
+            each = list(zip(one.held.values(), other.held.values(), strict=False))
+            same = (_same_input(*pair, one.t[own], other.t[theirs]) for pair in each)
+            if changes >= (1 if whole else FEW_CHANGES) and len(one.held) == len(other.held) and all(same):
+                return int(own.size)
+    return 0
+
+
+def _shifts(one: Record, other: Record) -> list[float]:
+    """Return the shifts of time at which the beginning of a record, from its first change on, is in another."""
+    own, valid = np.flatnonzero(one.valid), np.flatnonzero(other.valid)
+    changed = np.flatnonzero(np.diff(one.y[own]))
+    own = own[changed[:1].sum() :][: min(2 * FEW_CHANGES, valid.size)]
+    places = np.arange(valid.size - own.size + 1) if changed.size else np.arange(0)
+    for k, value in enumerate(one.y[own]):
+        places = places[other.y[valid[places + k]] == value]
+    found: list[float] = (other.t[valid[places]] - one.t[own[0]]).tolist()
     return found
+
+
+def _at_same_times(one: Array, other: Array) -> tuple[IndexArray, IndexArray]:
+    """Return the indices of equal instants of two clocks, up to rounding."""
+    slack = 1e-4 * float(other[-1] - other[0]) / max(other.size - 1, 1)
+    places = np.minimum(np.searchsorted(other, one - slack), other.size - 1)
+    found = np.flatnonzero(np.abs(other[places] - one) <= slack)
+    return found, places[found]
+
+
+def _same_input(one: HeldSignal, other: HeldSignal, own: Array, theirs: Array) -> bool:
+    """Return whether two inputs are equal at instants, as far as both are known there."""
+    known = (own >= one.t[0]) & (theirs >= other.t[0])
+    return bool(known.any()) and np.allclose(one.at(own[known]), other.at(theirs[known]), rtol=1e-9, atol=0.0)
 
 
 def _named_inputs(
@@ -318,17 +381,22 @@ def _named_inputs(
     if not inputs:
         raise DataError(f"{where}there is no input")
     return {
-        name: one if isinstance(one, HeldSignal) else HeldSignal(t, np.asarray(one, dtype=float))
+        name: one if isinstance(one, HeldSignal) else HeldSignal(t, np.asarray(one, dtype=float), assumed=True)
         for name, one in inputs.items()
     }
 
 
 def as_records(records: Any) -> list[Record]:
-    """Return one record or several as a list; a DataError where something else is given."""
+    """Return one record or several as a list; a DataError for anything else, and for records that overlap."""
     several = list(records) if isinstance(records, Iterable) else [records]
     for one in several:
         if not isinstance(one, Record):
             raise DataError(f"records must be a Record or a list of these, not {type(records).__name__}")
+    for (k, one), (later, other) in combinations(enumerate(several, start=1), 2):
+        if shared := _shared(one, other):
+            names = [f"{number}{f' ({each.name})' * bool(each.name)}" for number, each in ((k, one), (later, other))]
+            what = f"records {' and '.join(names)} have {shared} of their samples in common, input and output"
+            raise DataError(f"{what}: a copy makes standard errors too small; give each measured sample once")
     return several
 
 

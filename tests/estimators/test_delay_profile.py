@@ -1,9 +1,12 @@
 """Global search over the delay, and measured records: states, offsets, gaps, experiments, units."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
+from ctid_cli.estimation.common import assumed_holds
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimation.parameter_layout import Degrees, Layout
@@ -104,10 +107,11 @@ def test_as_many_zeros_as_poles_with_a_known_delay():
 # --- several experiments ---------------------------------------------------------------------------
 
 
-def test_one_experiment_twice_gives_the_same_model_and_half_the_variance():
+def test_an_experiment_and_its_negative_give_the_same_model_and_half_the_variance():
     record = record_of(noise=0.1)
+    negative = replace(record, y=-record.y, inputs=HeldSignal(record.input.t, -record.input.values))
     options = DelayProfile(2, 0, (0, 3), offset="estimate")
-    one, two = options.fit(record), options.fit([record, record])
+    one, two = options.fit(record), options.fit([record, negative])
     assert_same_model(two.model, one.model, 1e-6)
     assert two.parameter_names[-2:] == ("offset_1", "offset_2")
     assert two.cost == pytest.approx(one.cost, rel=1e-9)
@@ -187,3 +191,41 @@ def test_a_refinement_without_a_pole_counts_it_among_those_at_infinity():
     record = record_of(TransferFunction([1.0], [1.0, 1.0]))
     fit = DelayProfile(2, 0, (0.0, 0.0))._refine([record], (np.array([1.0, 1.0]), 0.0))
     assert (fit.model.order, fit.poles_at_infinity) == (1, 1)
+
+
+# --- the hold of the input -------------------------------------------------------------------------
+
+
+def sampled_multisine(hold, seed=0, count=300, interval=0.2):
+    """Return times, samples of a smooth input, and a noisy output of the input as held, or as smooth for None."""
+    rng, lead, fine = np.random.default_rng(seed), 100, 20
+    frequencies, phases = np.linspace(0.01, 0.5, 20), rng.uniform(0.0, 2.0 * np.pi, 20)
+    t = interval * np.arange(count + lead)
+    dense = interval / fine * np.arange((count + lead) * fine)
+    u, smooth = (0.3 * np.cos(2 * np.pi * np.outer(times, frequencies) + phases).sum(axis=1) for times in (t, dense))
+    signal = HeldSignal(dense, smooth, "foh") if hold is None else HeldSignal(t, u, hold)
+    y = simulate(TransferFunction([2.0], [1.0, 1.0], 1.03), signal, t) + 0.05 * rng.standard_normal(t.size)
+    return t[lead:] - t[lead], u[lead:], y[lead:]
+
+
+@pytest.mark.parametrize("hold", [None, "zoh"])
+def test_the_interval_of_the_delay_allows_for_the_hold_of_a_smooth_input(hold):
+    t, u, y = sampled_multisine(hold)
+    options = DelayProfile(1, 0, (0, 5), initial_state="estimate")
+    fit = options.fit(Record.from_arrays(t, u, y))
+    ((low, high),) = fit.intervals["delay"]
+    assert low <= 1.03 <= high
+    assert fit.marks()[0].startswith("The hold of the input was not given: ")
+    given = options.fit(Record.from_arrays(t, u, y, "zoh"))
+    assert not given.marks()
+    assert (given.parameters["delay"] - 1.03 < -2.0 * given.standard_errors["delay"]) == (hold is None)
+
+
+def test_a_hold_that_is_not_given_is_asked_for_smooth_inputs_only():
+    t, steps, y = np.arange(200.0), np.repeat([0.0, 1.0, -1.0, 2.0], 50), np.random.default_rng(0).standard_normal(200)
+    record = Record.from_arrays(t, steps, y)
+    assert assumed_holds(record) == {None: record}
+    two = Record(t, y, {"smooth": np.sin(t), "steps": steps})
+    assert list(assumed_holds([two])) == ["zoh", ("foh", "zoh"), ("band-limited", "zoh")]
+    given = replace(two, inputs={"smooth": HeldSignal(t, np.sin(t)), "steps": HeldSignal(t, steps)})
+    assert list(assumed_holds(given)) == [None]

@@ -169,16 +169,18 @@ def test_missing_output_errors_are_completed_and_not_in_the_sums():
     assert ratios == pytest.approx([1 / np.sqrt(0.9)] * 3, rel=0.08)
 
 
-def test_the_same_record_twice_has_its_errors_over_the_root_of_two():
+def test_a_record_and_its_negative_have_the_errors_of_one_over_the_root_of_two():
     one = record(UNSTABLE, PD, noise=0.1, count=800)
+    loop = replace(one.loop, reference=-one.loop.reference)
+    negative = replace(one, y=-one.y, inputs=HeldSignal(one.t, -one.input.values), loop=loop)
     options = LoopOutputError(2, 0, initial_state="estimate", offset="estimate", covariance="white")
-    once, twice = options.fit(one), options.fit([one, one])
+    once, twice = options.fit(one), options.fit([one, negative])
     assert twice.parameter_names[-8:] == ("x1_1", "x2_1", "x3_1", "offset_1", "x1_2", "x2_2", "x3_2", "offset_2")
     assert len(twice.initial_states) == len(twice.residuals) == 2
     for name in ("a1", "a2", "b0"):
         assert twice.parameters[name] == pytest.approx(once.parameters[name], abs=1e-5)
         assert twice.standard_errors[name] == pytest.approx(once.standard_errors[name] / np.sqrt(2), rel=0.01)
-    assert twice.parameters["offset_2"] == pytest.approx(once.parameters["offset"], abs=1e-6)
+    assert twice.parameters["offset_2"] == pytest.approx(-once.parameters["offset"], abs=1e-6)
 
 
 def test_integrator_offset_and_state_that_is_not_rest():

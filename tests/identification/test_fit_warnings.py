@@ -133,6 +133,16 @@ def test_what_has_no_remedy_is_said_without_one(fault):
     assert "--" not in found
 
 
+def test_halves_that_differ_are_named_by_a_fit_and_by_its_warnings():
+    one, late = record_of(seed=4, n=600), np.arange(600) >= 300
+    stronger = HeldSignal(one.t, np.where(late, 1.25, 1.0) * one.input.values)
+    record = Record(one.t, one.y + simulate(SYSTEM, stronger, one.t) - simulate(SYSTEM, one.input, one.t), one.input)
+    mark = KNOWN.fit(record).marks()[-1]
+    assert mark.startswith("The halves of the record differ (p < 0.0001): static gain ")
+    assert mark in identify([record], KNOWN).warnings
+    assert not KNOWN.fit(one).marks()
+
+
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
 def test_a_clean_record_needs_no_words(hold):
     assert identify([record_of(seed=3, hold=hold)], KNOWN).warnings == ()

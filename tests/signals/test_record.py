@@ -1,11 +1,13 @@
 """Records: masks, grids, loops and refusals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import Loop, Record
+from ctid_cli.signals.record import Loop, Record, as_records
 
 ONE = HeldSignal([0.0], [1.0])
 
@@ -81,3 +83,37 @@ def in_loop(t=T, u=T, hold="zoh", reference=(1.0, 2.0, 3.0, 4.0, 5.0), **more):
 def test_impossible_loops_are_refused(options, message):
     with pytest.raises(DataError, match=message):
         in_loop(**options)
+
+
+def noisy(seed=0, first=0, last=200, shift=0.0, step=1, quantum=0.0):
+    """Return a part of a record, perhaps with shifted times, fewer samples, or an output in steps."""
+    t, u = 0.1 * np.arange(200), np.repeat([0.0, 1.0, -1.0, 1.0], 50)
+    y = u + 0.05 * np.random.default_rng(seed).standard_normal(200)
+    y = quantum * np.round(y / quantum) if quantum else y
+    part = slice(first, last, step)
+    return Record.from_arrays(t[part] + shift, u[part], y[part], name=f"{seed}.csv")
+
+
+@pytest.mark.parametrize(
+    ("other", "common"),
+    [
+        ({}, 200),
+        ({"shift": 33.3}, 200),
+        ({"first": 60, "last": 120, "shift": -6.0}, 60),
+        ({"first": 150, "shift": 1.7}, 50),
+        ({"step": 3}, 67),
+    ],
+)
+def test_copies_of_a_record_and_overlapping_records_are_refused(other, common):
+    records = [noisy(1), noisy(), noisy(**other)]
+    with pytest.raises(DataError, match=rf"records 2 \(0.csv\) and 3 \(0.csv\) have {common} of their samples"):
+        as_records(records)
+
+
+@pytest.mark.parametrize("quantum", [0.0, 0.1])
+def test_repeated_experiments_and_neighbouring_parts_are_not_taken_as_copies(quantum):
+    records = [noisy(seed, quantum=quantum) for seed in range(3)]
+    parts = [noisy(5, last=100, quantum=quantum), noisy(5, first=99, quantum=quantum)]
+    assert as_records([*records, *parts]) == [*records, *parts]
+    reversed_input = replace(records[0], inputs=HeldSignal(records[0].t, -records[0].input.values))
+    assert len(as_records([records[0], reversed_input])) == 2
