@@ -182,6 +182,8 @@ class Estimator(Generic[LaidOut, AnyFit]):
         ``foh``, whichever fits better.
         """
         tried = {hold: self.prepare(one).fit(start) for hold, one in assumed_holds(record).items()}
+        if None in tried:
+            return tried[None]
         found = of_best_hold(tried)
         return found._joined([tried[hold] for hold in found.assumed_hold.others]) if found.assumed_hold else found
 
@@ -213,11 +215,12 @@ def assumed_holds(record: Any) -> dict[Holds | None, Any]:
 
 def of_best_hold(tried: Mapping[Holds | None, AnyFit]) -> AnyFit:
     """Return the fit with the least error, and holds of the input that fit as well."""
-    finite = {hold: fit for hold, fit in tried.items() if np.isfinite(fit._misfit)} or tried
+    if None in tried:
+        return tried[None]
+    named = {hold: fit for hold, fit in tried.items() if hold is not None}
+    finite = {hold: fit for hold, fit in named.items() if np.isfinite(fit._misfit)} or named
     best, fit = min(finite.items(), key=lambda each: each[1]._misfit)
-    if best is None:
-        return fit
-    likely = tuple(hold for hold, other in finite.items() if hold not in (None, best) and other._is_likely_as(fit))
+    likely = tuple(hold for hold, other in finite.items() if hold != best and other._is_likely_as(fit))
     return replace(fit, assumed_hold=AssumedHold(best, likely))
 
 

@@ -16,8 +16,8 @@ LARGEST_CONDITION = 1e14
 #: Significance level at which a changing variance of the innovations is allowed for. Measured, 200 samples, deviation
 #: proportional to the output: coverage of the gain 90, 93 and 96 % at .01, .05 and 1.
 CHANGING = 0.05
-#: Fewest samples for each parameter in the test of a changing variance.
-SAMPLES_PER_PARAMETER = 5
+#: Fewest samples for each parameter in the test of a changing variance, and fewest on which a tested column depends.
+SAMPLES_PER_PARAMETER, FEWEST = 5, 10
 #: Largest number of harmonics of a rounding error.
 HARMONICS = 50
 
@@ -154,7 +154,7 @@ def robust_dispersion(
     middle = covariance(noise)
     with np.errstate(invalid="ignore"):  # near a unit root
         along = [(covariance(high) - covariance(low)) / (2 * STEP) for low, high in noise.displaced]
-    changing = _changing(rows, errors, noise)
+    changing = _changing(rows, scaled, errors, middle, noise)
     if changing is None:
         variation = [*along, middle * np.sqrt(2.0 / noise.freedom)]
     else:
@@ -166,13 +166,17 @@ def robust_dispersion(
     return Dispersion(0.5 * (whole + whole.T), np.array(variation) * units, noise, changing is not None, rounded)
 
 
-def _changing(rows: Sequence[Array], errors: Sequence[Array], noise: NoiseModel) -> tuple[Array, list[Array]] | None:
+def _changing(
+    rows: Sequence[Array], columns: Sequence[Array], errors: Sequence[Array], covariance: Array, noise: NoiseModel
+) -> tuple[Array, list[Array]] | None:
     r"""Return what a changing variance of the innovations adds to a covariance, and its variation; None without change.
 
     The estimate is ``sum_t a_t v_t = sum_s g_s e_s`` with the innovations e and the rows g of
-    :meth:`NoiseModel.weights_of`. Koenker's test regresses ``e^2`` on the squares of the columns of g [1]_: other
-    changes of the variance do not matter. Squared innovations of the estimate without each sample (HC3 [2]_) then
-    replace their variance; those of a normal variable have the variance 2/3 of their square.
+    :meth:`NoiseModel.weights_of`. Koenker's test regresses ``e^2`` on squares of columns of g [1]_: other changes of
+    the variance do not matter. The columns are orthonormal ones along the principal axes of their fourth moments, which
+    do not depend on the parametrisation. The innovations of the residuals are ``e_s - w_s' sum g e``, with those w of the
+    sensitivities, and have the variance ``s^2 (1 - 2 w'g) + w'Cw``. Squared innovations of the estimate without each
+    sample (HC3 [2]_) then replace their variance; those of a normal variable have the variance 2/3 of their square.
 
     References
     ----------
@@ -188,19 +192,25 @@ def _changing(rows: Sequence[Array], errors: Sequence[Array], noise: NoiseModel)
     squares = np.concatenate([noise.innovations(e)[order:] for e in errors]) ** 2
     if squares.size < SAMPLES_PER_PARAMETER * size or not variance > 0.0:
         return None
-    regressors = g**2 / np.maximum((g**2).mean(axis=0), np.finfo(float).tiny)
-    regressors = np.column_stack((np.ones(squares.size), regressors))
+    orthonormal = np.linalg.qr(g)[0]
+    leverage = np.sum(orthonormal**2, axis=1)
+    axes = np.linalg.eigh((orthonormal * leverage[:, None]).T @ orthonormal)[1]
+    slopes = np.concatenate([np.column_stack([noise.innovations(x)[order:] for x in block.T]) for block in columns])
+    expected = 1.0 + np.sum(slopes * (slopes @ covariance / variance - 2.0 * g), axis=1)
+    squares = squares / np.maximum(expected, 0.1)
+    tested = (orthonormal @ axes) ** 2
+    tested = tested[:, np.sum(tested**2, axis=0) * FEWEST < 1.0]
+    regressors = np.column_stack((np.ones(squares.size), squares.size * tested))
     weights, _, rank, _ = np.linalg.lstsq(regressors, squares, rcond=1e-8)
     spread = float(np.sum((squares - squares.mean()) ** 2))
     explained = spread - float(np.sum((squares - regressors @ weights) ** 2))
     if not (spread > 0.0 and rank > 1 and chdtrc(rank - 1, squares.size * explained / spread) < CHANGING):
         return None
-    orthonormal = np.linalg.qr(g)[0]
-    expected = squares / np.maximum(1.0 - np.sum(orthonormal**2, axis=1), 0.1) ** 2
+    without = squares / np.maximum(1.0 - leverage, 0.1)
     i, j = np.triu_indices(size)
     products = np.zeros((i.size, i.size))
     for block in row_blocks(len(g)):
-        own = g[block][:, i] * g[block][:, j] * expected[block, None]
+        own = g[block][:, i] * g[block][:, j] * without[block, None]
         products += own.T @ own
     values, vectors = np.linalg.eigh(2.0 / 3.0 * products)
     variation = []
@@ -209,7 +219,7 @@ def _changing(rows: Sequence[Array], errors: Sequence[Array], noise: NoiseModel)
             change = np.zeros((size, size))
             change[i, j] = change[j, i] = np.sqrt(value) * vector
             variation.append(change)
-    return (g * (expected - variance)[:, None]).T @ g, variation
+    return (g * (without - variance)[:, None]).T @ g, variation
 
 
 def _of_rounding(rows: Array, rounding: Rounding, noise: NoiseModel) -> Array:

@@ -21,6 +21,8 @@ from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term, pole_text, same_pole
 from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 
+#: Ratio of two real poles up to which they are in one section.
+CLOSE = 2.0
 Number = TypeVar("Number", np.float64, np.complex128)
 
 
@@ -96,19 +98,18 @@ def pole_jacobian(denominator: ArrayLike, poles: ArrayLike) -> ComplexArray:
 def section_slopes(denominator: ArrayLike) -> Array:
     """Return derivatives of ``a_1 ... a_n`` by the logarithms of the coefficients of sections, shape (n, n).
 
-    A section is that of a complex pair, of two neighbouring real poles, so that these may meet, or of one real pole.
+    A section is that of a complex pair, of two close real poles, so that these may meet, or of one real pole.
     """
     roots = sorted_roots(np.asarray(denominator, dtype=float))
     sections = [np.array([1.0, -2.0 * pole.real, abs(pole) ** 2]) for pole in roots[roots.imag > 0]]
-    real = np.sort(-roots[roots.imag == 0].real)
-    # Of an odd number the one that leaves the closest pairs is alone.
-    alone = range(0, real.size, 2) if real.size % 2 else ()
-    if alone:
-        distances = [float(np.sum(np.diff(np.log(np.abs(np.delete(real, k))))[::2])) for k in alone]
-        single = alone[int(np.argmin(distances))]
-        sections.append(np.array([1.0, real[single]]))
-        real = np.delete(real, single)
-    sections += [np.array([1.0, low + high, low * high]) for low, high in zip(real[::2], real[1::2], strict=True)]
+    real = np.sort(-roots[roots.imag == 0].real).tolist()
+    while real:
+        slow = real.pop(0)
+        if real and 0.0 < real[0] < CLOSE * slow:
+            fast = real.pop(0)
+            sections.append(np.array([1.0, slow + fast, slow * fast]))
+        else:
+            sections.append(np.array([1.0, slow]))
     columns, n = list[Array](), roots.size
     for i, section in enumerate(sections):
         others = np.ones(1)
