@@ -280,6 +280,8 @@ def main(records, seed, kinds, processes):
     for kind in kinds:
         fits[kind] = list((pool.map if pool else map)(partial(fits_of, kind, seed), range(records)))
         print_kind(kind, fits[kind])
+    if pool:
+        pool.shutdown()
     if set(kinds) & set(GIVEN_KINDS):
         print_summary(fits)
 
