@@ -13,7 +13,7 @@ from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimators.determination import LEVEL, Accepted, Determination, cost_of_delay, determination_of
 from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit, delay_names
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
-from ctid_cli.inference.covariance import LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
+from ctid_cli.inference.covariance import LARGE_STANDARD_ERROR
 from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.intervals import BIASED, DelayInterval, UncertainValue
 from ctid_cli.inference.sensitivities import parts_of
@@ -53,12 +53,7 @@ def reported_parameters(
     """Return parameters and derived quantities, with their uncertainty if it exists and a response is detected."""
     found = found or Determination(((Accepted(fit, uncertainty, 0.0),),))
     biased, linear = uncertainty.kind == "biased", fit.linear
-    free, hessian = free_directions(linear)
-    singular = not condition_number(hessian) <= NEARLY_SINGULAR
-    unclear = {
-        fit.parameter_names[k]
-        for k in (free if singular else _undetermined(fit, uncertainty_of_data(fit, uncertainty)))
-    }
+    unclear = {fit.parameter_names[k] for k in _undetermined(fit, uncertainty_of_data(fit, uncertainty))}
     if not seen:
         unclear |= {name for name in fit.parameter_names if not name.startswith("offset")}
     intervals: dict[str, DelayInterval] = {}
@@ -66,7 +61,6 @@ def reported_parameters(
         if isinstance(laid_out, MeasuredRecords) and not biased and name in {*fit.parameter_names} - unclear:
             interval = _delay_interval(laid_out, linear, uncertainty, name)
             intervals |= {} if interval is None else {name: interval}
-    known = seen and not singular
 
     def estimates(each: MeasuredFit, law: Uncertainty) -> tuple[UncertainValue, ...]:
         return _estimates(each, law, unclear, intervals if each.theta is fit.theta else {})
@@ -74,7 +68,7 @@ def reported_parameters(
     return ReportedParameters(
         tuple(found.reported(estimates)),
         next(iter(intervals.values()), None),
-        tuple(found.reported(lambda each, law: _derived(each, law, known))),
+        tuple(found.reported(lambda each, law: _derived(each, law, seen))),
     )
 
 

@@ -90,7 +90,7 @@ class _Rows:
             reason = HELD if moved <= UNMOVED * abs(estimate) else ""
         error = self.law.error(gradient) if np.isfinite(gradient).all() and not reason else NAN
         if not reason and not np.isfinite(error):
-            reason = "The covariance of the coefficients is not defined."
+            reason = "The data do not determine it."
         reach = self.law.quantile(gradient, self.level) if np.isfinite(error) else NAN
         found = UncertainValue.symmetric(self.prefix + name, estimate, error, unit, reach, reason)
         self.found.append(found if signed or not estimate or not np.isfinite(error) else found.in_logarithm)

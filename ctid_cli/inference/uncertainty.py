@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
-from ctid_cli.inference.covariance import Dispersion, Rounding, robust_dispersion, white_noise_dispersion
+from ctid_cli.inference.covariance import (
+    Dispersion,
+    Rounding,
+    determined_directions,
+    robust_dispersion,
+    white_noise_dispersion,
+)
 from ctid_cli.inference.innovations import SampledNoise
 from ctid_cli.inference.intervals import student_quantiles
 from ctid_cli.inference.loop_noise import SensitivityFunction
@@ -82,6 +88,8 @@ Covariance = Literal["auto", "white", "robust", "bootstrap", "sandwich"]
 Formula = Literal["white", "robust", "bootstrap", "biased"]
 #: Default number of bootstrap draws.
 DRAWS = 500
+#: Share of a change of a quantity along undetermined directions that is rounding.
+NEGLIGIBLE = 1e-5
 #: Student's t with fewer degrees of freedom has no variance.
 LEAST_FREEDOM = 2.0
 #: Least degrees of freedom for a reliable noise model.
@@ -105,6 +113,8 @@ class Uncertainty:
     rounded: bool = False
     #: Whether the residuals pass as white.
     passed: bool = True
+    #: Directions that the data do not determine, of the length of those along the tangent, shape (p, k).
+    null: Array | None = field(repr=False, default=None)
 
     @classmethod
     def of(cls, kind: Formula, tangent: Array, found: Dispersion) -> "Uncertainty":
@@ -137,8 +147,16 @@ class Uncertainty:
         """Covariance of all parameters, NaN for fixed ones, shape (p, p)."""
         covariance = self.tangent @ self.free_covariance @ self.tangent.T
         held = ~self.tangent.any(axis=1)
+        held |= ~self.determined(np.eye(len(self.tangent)))
         covariance[held] = covariance[:, held] = np.nan
         return np.asarray(covariance)
+
+    def determined(self, gradients: Array) -> BoolArray:
+        """Return whether the data determine quantities with these gradients by the leading parameters, shape (N,)."""
+        if self.null is None:
+            return np.ones(len(gradients), dtype=bool)
+        lost = np.linalg.norm(gradients @ self.null[: gradients.shape[1]], axis=1)
+        return np.asarray(lost <= NEGLIGIBLE * np.linalg.norm(self.along(gradients), axis=1))
 
     def along(self, gradients: NDArray[Number]) -> NDArray[Number]:
         """Return derivatives of quantities by the free directions, from those by the leading parameters."""
@@ -148,7 +166,9 @@ class Uncertainty:
         """Return the standard errors of quantities with these gradients by the leading parameters, shape (N,)."""
         own = self.along(gradients)
         with np.errstate(invalid="ignore"):
-            return np.asarray(np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", own, self.free_covariance, own), 0.0)))
+            found = np.asarray(np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", own, self.free_covariance, own), 0.0)))
+        found[~self.determined(gradients)] = np.nan
+        return found
 
     def error(self, gradient: Array) -> float:
         """Return the standard error of a quantity with this gradient by the leading parameters."""
@@ -198,7 +218,8 @@ class Uncertainty:
 
     def transformed(self, jacobian: Array) -> "Uncertainty":
         """Return the uncertainty of parameters with these derivatives by the present ones, shape (q, p)."""
-        return replace(self, tangent=jacobian @ self.tangent)
+        null = None if self.null is None else jacobian @ self.null
+        return replace(self, tangent=jacobian @ self.tangent, null=null)
 
     @property
     def in_ignored_loop(self) -> "Uncertainty":
@@ -231,8 +252,13 @@ def estimate_uncertainty(
     """
     basis = np.eye(psi[0].shape[1]) if tangent is None else tangent
     free = psi if tangent is None else [block @ tangent for block in psi]
+    hessian = np.sum([block.T @ block for block in free], axis=0)
+    directions = determined_directions(hessian) if basis.size else None
+    if directions is not None and directions[0].size:
+        within, null = (basis @ each for each in directions)
+        law = estimate_uncertainty(psi, residuals, kind, draws, tangent=within, loop=loop, rounding=rounding)
+        return replace(law, null=null)
     if kind == "white":
-        hessian = np.sum([block.T @ block for block in free], axis=0)
         count = sum(block.size for block in residuals)
         found = white_noise_dispersion(hessian, sum(float(e @ e) for e in residuals), count)
         return Uncertainty.of("white", basis, found)

@@ -110,7 +110,7 @@ def test_as_many_zeros_as_poles_with_a_known_delay():
 def test_an_experiment_and_its_negative_give_the_same_model_and_half_the_variance():
     record = record_of(noise=0.1)
     negative = replace(record, y=-record.y, inputs=HeldSignal(record.input.t, -record.input.values))
-    options = DelayProfile(2, 0, (0, 3), offset="estimate")
+    options = DelayProfile(2, 0, (0, 3), offset="estimate", covariance="white")
     one, two = options.fit(record), options.fit([record, negative])
     assert_same_model(two.model, one.model, 1e-6)
     assert two.parameter_names[-2:] == ("offset_1", "offset_2")
