@@ -409,7 +409,7 @@ def assessed(
         hessian = tangent.T @ equations.hessian @ tangent
         found = white_noise_dispersion(hessian, equations.squared_error, problem.samples)
         law = Uncertainty.of("white", tangent, found)
-    if status is Status.CONVERGED and law is not None and not law.defined:
+    if status is Status.CONVERGED and law is not None and law.singular:
         status = Status.SINGULAR
     covariance = nothing if law is None else law.covariance
     spread = float(np.sum((y - y.mean()) ** 2))

@@ -225,7 +225,7 @@ class MeasuredFit(DeferredFields, Fit):
 
     def _with_law(self, law: Uncertainty) -> Self:
         """Return the fit with its uncertainty; singular if it converged but has no covariance."""
-        undefined = law.kind != "biased" and (law.null is not None or not law.defined)
+        undefined = law.kind != "biased" and law.singular
         singular = self.status is Status.CONVERGED and undefined
         status, change = Status.SINGULAR if singular else self.status, None if law.kind == "biased" else self._change()
         return replace(self, covariance=law.covariance, law=law, status=status, change=change)

@@ -143,6 +143,11 @@ class Uncertainty:
         return bool(np.isfinite(self.free_covariance).all())
 
     @property
+    def singular(self) -> bool:
+        """Whether there is a direction without a standard error."""
+        return self.null is not None or not self.defined
+
+    @property
     def covariance(self) -> Array:
         """Covariance of all parameters, NaN for fixed ones, shape (p, p)."""
         covariance = self.tangent @ self.free_covariance @ self.tangent.T

@@ -114,7 +114,10 @@ def test_equations_without_information_leave_everything_undetermined():
     # A constant input and a constant offset have the same effect.
     assert statuses["b0"] == statuses["offset"] == "undetermined"
     assert statuses["delay"] == "fixed"
-    assert all(np.isnan(row.standard_error) for row in result.derived)
+    derived = {item.name: item.standard_error for item in result.derived}
+    assert np.isnan(derived["static_gain"])
+    # The free response determines the pole.
+    assert derived["time_constant_1"] < 1e-6
 
 
 def test_the_delay_has_a_profile_interval_where_the_cost_is_not_quadratic():

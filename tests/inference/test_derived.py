@@ -108,4 +108,4 @@ def test_integrators_and_undefined_covariances_have_reasons():
         assert np.isnan(gain.standard_error)
     for model, size in ((TransferFunction([1.0], [1.0, 2.0]), 2), (TWO_MODES, 6)):
         rows = by_name(model, np.full((size, size), np.nan))
-        assert all("not defined" in row.reason and np.isnan(row.standard_error) for row in rows.values())
+        assert all("not determine" in row.reason and np.isnan(row.standard_error) for row in rows.values())
