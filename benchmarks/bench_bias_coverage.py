@@ -27,7 +27,7 @@ from ctid_cli import (
     TransferFunction,
     simulate,
 )
-from ctid_cli.estimators.frequency_domain import fit_of
+from ctid_cli.estimators.frequency_domain import FrequencyDomainFit, _values
 from ctid_cli.estimators.measured_fit import MeasuredFit, fitted
 
 #: Frequency responses: model, degrees, integrators and sampling interval; 0 for G(jw).
@@ -96,7 +96,8 @@ def near_truth(name: str, options: DelayProfile, measured: object) -> MeasuredFi
     """Return the fit in the basin of the true model."""
     if name in RESPONSES:
         model, poles = RESPONSES[name][:2]
-        return fit_of(measured, measured.local((model.denominator[: poles + 1], model.delay)))
+        found = fitted(measured, measured.local((model.denominator[: poles + 1], (model.delay,))), None)
+        return FrequencyDomainFit(**_values(found), data=measured.source)._with_uncertainty("auto", 0)
     models = TWO_INPUTS[name][0]
     delays = tuple(model.delay for model in models)
     poles = models[0].denominator if options.common else np.concatenate([model.poles for model in models])

@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 
 from ctid_cli import HeldSignal, TransferFunction, simulate
-from ctid_cli.inference.covariance import robust_covariance
+from ctid_cli.inference.covariance import robust_dispersion
 
 SAMPLES, INTERVAL = 800, 0.1
 SYSTEMS = {
@@ -75,7 +75,7 @@ def main():
             for _ in range(args.draws):
                 v = root @ rng.standard_normal(SAMPLES)
                 error = solve @ v
-                covariance, _ = robust_covariance([psi], [v - psi @ error])
+                covariance = robust_dispersion([psi], [v - psi @ error]).covariance
                 ratios.append(np.sqrt(np.diag(covariance)) / deviation)
                 scores.append(error / deviation)
         middle = np.median(ratios, axis=0)
