@@ -3,7 +3,7 @@
 import difflib
 import os
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 from typing import Any
 
@@ -15,6 +15,12 @@ def listed(words: Iterable[object]) -> str:
     """Return words as a list in a sentence: ``a, b and c``, without duplicates."""
     *first, end = dict.fromkeys(map(str, words))
     return f"{', '.join(first)} and {end}" if first else end
+
+
+def span(values: Sequence[float], digits: int) -> str:
+    """Return the least and the largest of several values, as ``1.96 to 2.1``."""
+    low, high = (f"{value:.{digits}g}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
 
 
 def count(n: int, noun: str) -> str:

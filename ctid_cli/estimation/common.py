@@ -178,8 +178,8 @@ class Estimator(Generic[LaidOut, AnyFit]):
     def fit(self, record: Any, start: Start | None = None) -> AnyFit:
         """Estimate from a record, or several if allowed, and from a start if the estimator uses one.
 
-        A DataError states why estimation is impossible. A smooth input whose hold is not given is taken as ``zoh`` or
-        ``foh``, whichever fits better.
+        A DataError states why estimation is impossible. A smooth input whose hold is not given has the one that
+        fits best.
         """
         tried = {hold: self.prepare(one).fit(start) for hold, one in assumed_holds(record).items()}
         if None in tried:

@@ -156,10 +156,10 @@ class DelayProfile(RecordsEstimator):
         Interpolation of the measured output between samples; does not affect the estimate.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
         Noise assumed for the standard errors: white, or coloured with an autocorrelation estimated from the residuals
-        (``robust``), which also allows for a changing variance and, for a coarsely rounded
-        output; ``bootstrap`` adds bootstrap-t intervals. ``auto`` is robust, and white if it finds white noise of
-        constant variance; there are no errors if the residuals do not pass the Ljung-Box test at the 5 % level and the
-        record is from a loop that the estimator ignores.
+        (``robust``), which also allows for a changing variance and for a coarsely rounded output; ``bootstrap`` adds
+        bootstrap-t intervals. ``auto`` is robust, and white if it finds white noise of constant variance; there are no
+        errors if the residuals do not pass the Ljung-Box test at the 5 % level and the record is from a loop that the
+        estimator ignores.
         ``sandwich`` is an earlier name of ``robust``.
     bootstrap_draws : int, default 500
         Number of simulated noise sequences of a bootstrap [-].

@@ -247,9 +247,8 @@ class Identification(DeferredFields, FittedModel, Shown):
             noise += ["the rounding of the output"] * found.rounded
             text = f"Standard errors allow for {listed(noise or ['coloured noise' + why])}"
         if found.bootstrap is None:
-            reach, freedom = found.quantiles(), found.freedom(found.tangent[found.tangent.any(axis=1)])
-            text += f"; intervals are estimate -+ {_span(reach[np.isfinite(reach)], 3)} of them"
-            text += f" (t, {_span(freedom, 4)} degrees of freedom)"
+            reach, freedom = found.spans()
+            text += f"; intervals are estimate -+ {reach} of them (t, {freedom} degrees of freedom)"
         else:
             draws = f"95 % of {len(found.bootstrap.errors)} estimates from simulated noise"
             text += f"; intervals are estimate -+ as many of them as {draws} keep within (bootstrap-t)"
@@ -433,12 +432,6 @@ def answer_of(options: Options, records: Sequence[Record], used: Sequence[BoolAr
     ]
     best = min(tests, key=lambda test: test.p_value)
     return replace(best, p_value=min(1.0, len(names) * best.p_value))
-
-
-def _span(values: Array, digits: int) -> str:
-    """Return the least and the largest of several values, in words."""
-    low, high = (f"{value:.{digits}g}" for value in (values.min(), values.max()))
-    return low if low == high else f"{low} to {high}"
 
 
 def unsafe_intervals(found: Identification) -> list[str]:

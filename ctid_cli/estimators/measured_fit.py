@@ -214,9 +214,10 @@ class MeasuredFit(DeferredFields, Fit):
                 rounding=() if self.noise or self.weighting else self.rounding,
             )
         if self.noise is not None and found.kind == "white" and found.defined:
-            psi, steps = [block @ self.tangent for block in self.sensitivities], [*map(steps_of, self.used)]
+            psi, steps = [block @ found.tangent for block in self.sensitivities], [*map(steps_of, self.used)]
             restricted = restricted_dispersion(self.noise.noise, psi, self.residuals, steps)
-            found = Uncertainty.of("white", self.tangent, restricted)
+            law = Uncertainty.of("white", found.tangent, restricted)
+            found = replace(law, null=found.null, passed=found.passed)
         return found.in_ignored_loop if self.in_ignored_loop and kind == "auto" else found
 
     def _with_uncertainty(self, kind: Covariance, draws: int) -> Self:
@@ -259,7 +260,7 @@ class MeasuredFit(DeferredFields, Fit):
         if name not in self.parameter_names or name in self.intervals:
             return self.intervals.get(name, ())
         value, reach = self.parameters[name], self.quantiles[name] * self.standard_errors[name]
-        return ((value - reach, value + reach),)
+        return ((value - reach, value + reach),) if np.isfinite(reach) else ((value, value),)
 
     def _change(self) -> ParameterChange | None:
         """Return a change of the parameters between the halves of a record, or between records."""

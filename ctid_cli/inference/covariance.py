@@ -119,6 +119,8 @@ def determined_directions(hessian: Array) -> tuple[Array, Array] | None:
 def condition_number(hessian: Array) -> float:
     """Return the condition number of ``sum psi psi'`` scaled to unit diagonal, independent of parameter units."""
     diagonal = np.diag(hessian)
+    if not hessian.size:
+        return 1.0
     if not np.isfinite(hessian).all() or (diagonal <= 0).any():
         return float("inf")
     scale = 1.0 / np.sqrt(diagonal)

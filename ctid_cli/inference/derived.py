@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
+from ctid_cli.inference.covariance import LARGE_STANDARD_ERROR
 from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.inference.sensitivities import parts_of
 from ctid_cli.inference.uncertainty import Uncertainty
@@ -89,8 +90,8 @@ class _Rows:
             moved = np.abs(self.law.along(gradient)).max(initial=0.0)
             reason = HELD if moved <= UNMOVED * abs(estimate) else ""
         error = self.law.error(gradient) if np.isfinite(gradient).all() and not reason else NAN
-        if not reason and not np.isfinite(error):
-            reason = "The data do not determine it."
+        if not reason and (not np.isfinite(error) or (not signed and error > LARGE_STANDARD_ERROR * abs(estimate) > 0)):
+            error, reason = NAN, "The data do not determine it."
         reach = self.law.quantile(gradient, self.level) if np.isfinite(error) else NAN
         found = UncertainValue.symmetric(self.prefix + name, estimate, error, unit, reach, reason)
         self.found.append(found if signed or not estimate or not np.isfinite(error) else found.in_logarithm)

@@ -101,8 +101,7 @@ class AssumedHold(NamedTuple):
         best, *likely = (each if isinstance(each, str) else ", ".join(each) for each in (self.hold, *self.others))
         start = f"The hold of the input was not given: {best} fits"
         if likely:
-            joined = f"and {listed(likely)} not clearly worse; the interval of the delay contains those for all of them"
-            return f"{start} best, {joined}. Give the hold."
+            return f"{start} best, and {listed(likely)} not clearly worse. Give the hold."
         return "" if best == "zoh" else f"{start} best. Give the hold."
 
 

@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IntArray
-from ctid_cli.inference.covariance import Dispersion
-from ctid_cli.inference.noise_model import levinson
+from ctid_cli.inference.covariance import Dispersion, undefined
+from ctid_cli.inference.noise_model import STEP, levinson
 from ctid_cli.signals.noise import ArmaNoise
 
 #: Numbers of coefficients of D and of C.
@@ -32,6 +32,8 @@ Orders = tuple[int, int]
 MOST_CHOSEN, MOST_GIVEN = 3, 8
 #: Greatest inverse hyperbolic tangent of a partial correlation, which is then 1 - 1.7e-6.
 FARTHEST = 7.0
+#: The same for the restricted likelihood, with room for differences: the correlation is then 1 - 1.2e-5.
+RESTRICTED = 6.0
 #: Lags per coefficient of the long autoregression of Hannan and Rissanen's method, and least number of samples per lag.
 LONG_LAGS, SAMPLES_PER_LAG = 10, 10
 #: Relative decrease of the scaled squares at which a fit ends, final and in comparisons of orders; most evaluations.
@@ -183,8 +185,10 @@ def restricted_dispersion(
 
     orders = len(noise.denominator) - 1, len(noise.numerator) - 1
     likelihood, size = _Likelihood(errors, steps, orders), psi[0].shape[1]
-    spare = likelihood.count - size
-    scale = 1.0 / np.linalg.norm(np.concatenate(psi), axis=0)
+    spare, lengths = likelihood.count - size, np.linalg.norm(np.concatenate(psi), axis=0)
+    if not (size and spare > 0 and (lengths > 0.0).all()):
+        return undefined(size)
+    scale = 1.0 / lengths
     rows = [np.vstack(((block * scale).T, e)) for block, e in zip(psi, errors, strict=True)]
 
     def at(z: Array) -> tuple[float, Array]:
@@ -203,15 +207,15 @@ def restricted_dispersion(
         inverse = np.linalg.inv(triangle[:size, :size])
         return np.asarray(inverse @ inverse.T * triangle[size, size] ** 2 / spare * np.outer(scale, scale))
 
-    start = np.clip(_transformed(np.array(noise.denominator), np.array(noise.numerator)), -FARTHEST, FARTHEST)
-    limits = [(-FARTHEST, FARTHEST)] * start.size
+    start = np.clip(_transformed(np.array(noise.denominator), np.array(noise.numerator)), -RESTRICTED, RESTRICTED)
+    limits = [(-RESTRICTED, RESTRICTED)] * start.size
     z = minimize(lambda z: at(z)[0], start, bounds=limits, method="L-BFGS-B").x if limits else start
     middle = covariance(z)
     values, vectors = np.linalg.eigh(_curvature(lambda z: at(z)[0], z))
     along = []
     for value, vector in zip(values, vectors.T, strict=True):
-        step = 0.01 * vector / np.sqrt(0.5 * max(value, 1.0))
-        along.append((covariance(z + step) - covariance(z - step)) / 0.02)
+        step = STEP * vector / np.sqrt(0.5 * max(value, 1.0))
+        along.append((covariance(z + step) - covariance(z - step)) / (2.0 * STEP))
     return Dispersion(middle, np.array([middle * np.sqrt(2.0 / spare), *along]))
 
 

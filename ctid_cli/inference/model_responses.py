@@ -147,7 +147,9 @@ class Estimated:
         """Return the covariances of real and imaginary parts from their gradients, shape (N, 2, 2)."""
         own = self.law.along(slopes)
         parts = np.stack((own.real, own.imag), axis=1)
-        return np.asarray(np.einsum("nki,ij,nlj->nkl", parts, self.law.free_covariance, parts))
+        found = np.asarray(np.einsum("nki,ij,nlj->nkl", parts, self.law.free_covariance, parts))
+        found[~(self.law.determined(slopes.real) & self.law.determined(slopes.imag))] = np.nan
+        return found
 
     def draws(self) -> Iterator[Parametric]:
         """Yield models with drawn parameters, without invalid ones."""
@@ -184,7 +186,7 @@ class Estimated:
             lower, upper = value - half, value + half
         else:
             behind = (one.derivative if model.differentiated else one for one in self.draws())
-            lower, upper = _quantiles(np.array([one.simulated(signal, t) for one in behind]), level)
+            lower, upper = _quantiles(np.array([one.simulated(signal, t) for one in behind]), level, errors)
         return ResponseBand(t, value, errors, lower, upper, level)
 
     def over_frequency(self, frequencies: ArrayLike | None, level: float, bands: Bands) -> FrequencyBand:
@@ -207,8 +209,8 @@ class Estimated:
             drawn = np.array([one.model.frequency_response(w) for one in self.draws()])
             with np.errstate(invalid="ignore", divide="ignore"):
                 turned = np.angle(drawn / value)
-            lower, upper = _quantiles(np.abs(drawn), level)
-            low_phase, high_phase = (phase + end for end in _quantiles(turned, level))
+            lower, upper = _quantiles(np.abs(drawn), level, gain_error)
+            low_phase, high_phase = (phase + end for end in _quantiles(turned, level, phase_error))
         covariance = self.of_parts(slopes)
         return FrequencyBand(
             w,
@@ -244,10 +246,11 @@ class Estimated:
         return PoleBand(value, covariance, np.hypot(*errors.T), value - half, value + half, reach, level)
 
 
-def _quantiles(drawn: Array, level: float) -> tuple[Array, Array]:
-    """Return the ends of the central interval of draws; NaN are ignored."""
-    low, high = np.nanquantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
-    return low, high
+def _quantiles(drawn: Array, level: float, errors: Array) -> tuple[Array, Array]:
+    """Return the ends of the central interval of draws, without NaN; NaN where there is no standard error."""
+    ends = np.nanquantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+    ends[:, np.isnan(errors)] = np.nan
+    return ends[0], ends[1]
 
 
 def _ellipse(level: float, degrees_of_freedom: float) -> float:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeVar
+from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from ctid_cli.inference.covariance import (
     Rounding,
     determined_directions,
     robust_dispersion,
+    undefined,
     white_noise_dispersion,
 )
 from ctid_cli.inference.innovations import SampledNoise
@@ -25,6 +26,7 @@ from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.progress import report, reported
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record
+from ctid_cli.text import span
 
 Number = TypeVar("Number", np.float64, np.complex128)
 #: Fixed seed of the noise, for reproducible results.
@@ -100,6 +102,9 @@ ENOUGH_FREEDOM = 5.0
 class Uncertainty:
     """Covariance of the parameters, and quantiles of their intervals."""
 
+    #: Field in files of earlier versions.
+    former: ClassVar[tuple[str, ...]] = ("effective_count",)
+
     kind: Formula
     #: Directions in which the parameters are free, shape (p, f), and the covariance along them, shape (f, f).
     tangent: Array
@@ -136,6 +141,11 @@ class Uncertainty:
         if not free.size:
             return cls("white", np.eye(len(covariance)), covariance)
         return cls("white", np.eye(len(covariance))[:, free], covariance[np.ix_(free, free)])
+
+    def of_samples(self, effective_count: float) -> "Uncertainty":
+        """Return the uncertainty with the degrees of freedom of a number of samples of white noise."""
+        freedom = max(LEAST_FREEDOM, effective_count - len(self.free_covariance))
+        return replace(self, variation=Dispersion.scaled(self.free_covariance, freedom).variation)
 
     @property
     def defined(self) -> bool:
@@ -195,6 +205,12 @@ class Uncertainty:
     def degrees_of_freedom(self) -> float:
         """Least degrees of freedom of Student's t of a parameter [-]."""
         return float(self.freedom(self.tangent[self.tangent.any(axis=1)]).min(initial=np.inf))
+
+    def spans(self) -> tuple[str, str]:
+        """Return the least to largest half-width of parameters in standard errors, and degrees of freedom, in words."""
+        given = np.isfinite(self.errors(np.eye(len(self.tangent)))) & self.tangent.any(axis=1)
+        freedom = self.freedom(self.tangent[given])
+        return span(student_quantiles(freedom).tolist(), 3), span(freedom.tolist(), 4)
 
     @property
     def effective_count(self) -> float:
@@ -257,8 +273,10 @@ def estimate_uncertainty(
     """
     basis = np.eye(psi[0].shape[1]) if tangent is None else tangent
     free = psi if tangent is None else [block @ tangent for block in psi]
+    if not basis.shape[1]:
+        return Uncertainty.of("white", basis, undefined(0))
     hessian = np.sum([block.T @ block for block in free], axis=0)
-    directions = determined_directions(hessian) if basis.size else None
+    directions = determined_directions(hessian)
     if directions is not None and directions[0].size:
         within, null = (basis @ each for each in directions)
         law = estimate_uncertainty(psi, residuals, kind, draws, tangent=within, loop=loop, rounding=rounding)

@@ -101,7 +101,7 @@ class FrequencyFitResult(FitResult):
             text = "Standard errors are based on those of the data, with which the residuals agree"
         else:
             text = "Standard errors are based on the residuals of the lines, assumed independent"
-        return f"{text}; intervals are estimate -+ {law.quantile(np.zeros(1)):.3g} of them."
+        return f"{text}; intervals are estimate -+ {law.spans()[0]} of them."
 
     def quality(self) -> Iterator[tuple[str, str]]:
         """Yield measures of the quality of the fit."""

@@ -24,6 +24,7 @@ import ctid_cli
 from ctid_cli.canonical import content_hash, read_json
 from ctid_cli.errors import DataError
 from ctid_cli.inference.fit import DeferredFields
+from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.signals.files import file_sha256, require_file
 
 #: Maximum size of a file that is read [bytes]; ten thousand bootstrap draws need less.
@@ -242,15 +243,19 @@ def _array(content: Any, dtype: Any, place: str) -> Any:
 
 def _instance(content: Any, kind: type, place: str) -> Any:
     hints = _hints(kind)
-    defaults = {each.name: each.default for each in dataclasses.fields(kind)}
     # Older files lack fields added since.
-    later = {name for name in hints if defaults[name] is not dataclasses.MISSING}
+    missing = dataclasses.MISSING
+    added = (each for each in dataclasses.fields(kind) if (each.default, each.default_factory) != (missing, missing))
+    later = {each.name for each in added} & {*hints}
     known = isinstance(content, Mapping) and content.get("type") == kind.__name__
     if not known or not {*hints} - later <= {*content} - {"type"} <= {*hints, *getattr(kind, "former", ())}:
         _refuse_part(place)
     values = {name: decoded(content[name], hint, f"{place}.{name}") for name, hint in hints.items() if name in content}
     late = dict.fromkeys(kind.deferred, ()) if issubclass(kind, DeferredFields) else {}
-    return kind(**values, **late)
+    found = kind(**values, **late)
+    if isinstance(found, Uncertainty) and "effective_count" in content:
+        return found.of_samples(_plain(content["effective_count"], float, place))
+    return found
 
 
 def _plain(content: Any, hint: Any, place: str) -> Any:

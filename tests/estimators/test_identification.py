@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from ctid_cli.estimation.optimum.box import LIMITS
 from ctid_cli.estimators.delay_profile import DelayProfile
@@ -226,3 +227,21 @@ def test_the_cost_about_the_delay_is_least_at_the_estimate():
     step = np.diff(near.delays).max()
     assert abs(inside[0] - item.low) <= 1.5 * step
     assert abs(inside[-1] - item.high) <= 1.5 * step
+
+
+@pytest.mark.parametrize("noise_model", ["white", "arma:1,0"])
+def test_a_sine_determines_the_response_at_its_frequency_only(noise_model):
+    t, rng = 0.1 * np.arange(400), np.random.default_rng(0)
+    w = 2.0 * np.pi / 4.0
+    gain = 2.0 / (1j * w + 1.0)
+    noise = lfilter([0.02], [1.0, -0.7], rng.standard_normal(400))
+    record = Record.from_arrays(t, np.sin(w * t), abs(gain) * np.sin(w * t + np.angle(gain)) + noise, "foh")
+    fit = DelayProfile(2, 0, (0.0, 0.0), initial_state="periodic", noise_model=noise_model).fit(record)
+    assert fit.status is Status.SINGULAR
+    assert np.isnan([*fit.standard_errors.values()]).all()
+    for bands in ("linearised", "sampled"):
+        found = fit.frequency_response([0.1, w, 10.0], bands=bands)
+        assert np.isnan([found.gain_error, found.gain_lower, found.gain_upper])[:, [0, 2]].all()
+        assert found.gain_lower[1] < abs(gain) < found.gain_upper[1]
+        assert np.isnan(found.covariance[[0, 2]]).all()
+    assert np.isnan(fit.poles().standard_error).all()

@@ -15,10 +15,12 @@ from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.intervals import student_quantile
+from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
+from ctid_cli.storage.result_file import decoded, encoded
 
 DELAY = 0.25
 ESTIMATORS = {
@@ -91,3 +93,12 @@ def test_a_fit_that_ignores_a_loop_has_no_errors_where_residuals_are_coloured(na
     assert np.isnan([*found.standard_errors.values()]).all()
     assert fitted(name, 0.9, "robust", feedback=True).standard_errors == fitted(name, 0.9, "robust").standard_errors
     assert fitted(name, 0.0, "auto", feedback=True).standard_errors == fitted(name, 0.0, "auto").standard_errors
+
+
+def test_files_of_earlier_versions_have_the_degrees_of_freedom_of_their_number_of_samples():
+    law = fitted("delay_profile", 0.9, "auto").law
+    content = encoded(law)
+    del content["variation"]
+    content["effective_count"] = 33.0
+    found = decoded(content, Uncertainty, "law")
+    assert found.quantiles() == pytest.approx(student_quantile(30.0), rel=1e-9)
