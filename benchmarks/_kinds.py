@@ -678,6 +678,9 @@ def smooth_input(rng, number):
     # It begins at zero, where the record begins.
     u = (np.sin(np.outer(t, w) + phases) - np.sin(phases)).sum(axis=1)
     case = simulated(rng, system, t[::fine], HeldSignal(t, u, "foh"), **drawn_noise(rng))
+    # The hold is not given.
+    record = case.data
+    case = replace(case, data=Record.from_arrays(record.t, record.input.at(record.t), record.y))
     return case.fitted_with(**one_of(rng, poles, 0, (0.0, 5.0)))
 
 

@@ -237,7 +237,7 @@ def test_a_sine_determines_the_response_at_its_frequency_only(noise_model):
     noise = lfilter([0.02], [1.0, -0.7], rng.standard_normal(400))
     record = Record.from_arrays(t, np.sin(w * t), abs(gain) * np.sin(w * t + np.angle(gain)) + noise, "foh")
     fit = DelayProfile(2, 0, (0.0, 0.0), initial_state="periodic", noise_model=noise_model).fit(record)
-    assert fit.status is Status.SINGULAR
+    assert not fit.status.succeeded
     assert np.isnan([*fit.standard_errors.values()]).all()
     for bands in ("linearised", "sampled"):
         found = fit.frequency_response([0.1, w, 10.0], bands=bands)
