@@ -224,10 +224,10 @@ def restricted_likelihood(products: Array, count: int, blocks: int, partial: Arr
     return _Likelihood(float(criterion), gradient, steps @ toeplitz @ steps.T, float(squared / left))
 
 
-def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array]) -> NoiseModel:
+def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array], *, aicc: bool = False) -> NoiseModel:
     """Return the REML model of the noise from the residuals of a fit with sensitivities psi of full rank.
 
-    The order has the least BIC among those up to 8, until it has risen three times, and the one that Akaike's
+    The order has the least BIC, or AICc, among those up to 8, until it has risen three times, and the one that Akaike's
     criterion chooses for the Yule-Walker model, for noise with a long memory. The inverse hyperbolic tangents of the
     partial correlations are nearly normal, with twice the inverse of the second derivatives of the criterion as
     covariance.
@@ -257,7 +257,8 @@ def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array]) -> Nois
 
     def penalised(partial: Array) -> float:
         k = partial.size + 1
-        return float(at(partial).criterion + k * np.log(count))
+        penalty = 2 * k + 2 * k * (k + 1) / max(count - size - k, 1) if aicc else k * np.log(count)
+        return float(at(partial).criterion + penalty)
 
     best = partial = np.zeros(0)
     least, rises = penalised(best), 0

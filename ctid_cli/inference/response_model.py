@@ -337,4 +337,4 @@ def residual_noise(model: ResponseModel) -> NoiseModel:
     determined = columns[:, :taps] @ (model.factor @ found.right[:, found.squares > 1.0])
     psi = np.column_stack([determined, columns[:, [taps + k for k in fixed]]])
     basis, singular, _ = np.linalg.svd(psi / np.linalg.norm(psi, axis=0), full_matrices=False)
-    return fit_residual_noise([basis[:, singular > 1e-9 * singular[0]]], [model.parts(fixed)[1]])
+    return fit_residual_noise([basis[:, singular > 1e-9 * singular[0]]], [model.parts(fixed)[1]], aicc=True)
