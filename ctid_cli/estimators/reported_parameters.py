@@ -98,13 +98,9 @@ def direction_names(fit: MeasuredFit) -> list[str]:
     """Return names of the free directions: numbers of poles as in the list of derived quantities, and parameters."""
     found = []
     for column in fit.tangent.T:
-        place = int(np.argmax(np.abs(column)))
-        name = fit.parameter_names[place]
-        own = re.fullmatch(r"((?:.+_)?)a\d+", name)
-        if own is None:
+        own = re.fullmatch(r"((?:.+_)?)a\d+", fit.parameter_names[int(np.argmax(np.abs(column)))])
+        if own is None or isinstance(fit, SubmodelsFit):
             found.append(fit.parameter_names[int(np.flatnonzero(column)[0])])
-        elif np.count_nonzero(column) == 1 and isinstance(fit, SubmodelsFit):
-            found.append(name)
         else:
             prefix, parts = own[1], fit.model.parts if isinstance(fit.model, MultiInputModel) else {"": fit.model}
             model = parts.get(prefix[:-1]) or next(iter(parts.values()))

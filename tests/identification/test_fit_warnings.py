@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.identification.fit_warnings import MOST, fit_warnings
@@ -12,6 +13,7 @@ from ctid_cli.identification.held_back import block_numbers, compared, held_back
 from ctid_cli.identification.identify import identify
 from ctid_cli.identification.remedies import tried_remedies
 from ctid_cli.inference.fit import Status
+from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
@@ -225,3 +227,10 @@ def test_of_a_search_that_did_not_end_nothing_else_is_said():
     unfinished = replace(found, fit=replace(found.fit, status=Status.MAX_ITERATIONS))
     (text,) = fit_warnings(unfinished)
     assert text.startswith("The iterations stopped at max_iterations")
+
+
+def test_a_sum_with_a_pole_at_a_bound_has_warnings():
+    """A submodel too many: its poles run to a bound, and the free directions are those of coefficients."""
+    found = identify([record_of(TransferFunction([2.0], [1.0, 2.0]), n=300)], AdditiveOutputError((Term(2, 0),) * 2))
+    assert found.fit.held_poles
+    assert any(text.startswith("Held at the border") for text in found.warnings)
