@@ -569,7 +569,7 @@ def kept(rng, n, low, high, values):
 
 
 def building(rng, number):
-    """Return a record of room temperature in intervals of half an hour, from weeks before it."""
+    """Return a record of indoor temperature in intervals of half an hour, from weeks before it."""
     n, first, interval = 1199, 500, 0.5
     t = interval * np.arange(-first, n)
     weather = lfilter([1.0], [1.0, -0.99], 0.4 * rng.standard_normal(t.size))

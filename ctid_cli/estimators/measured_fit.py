@@ -22,7 +22,7 @@ from ctid_cli.estimation.output_sensitivities import sensitivities
 from ctid_cli.estimation.parameter_layout import Degrees, Layout
 from ctid_cli.estimation.robust_fit import RobustFit
 from ctid_cli.filtering.bank import Equations
-from ctid_cli.inference.covariance import Rounding, condition_number
+from ctid_cli.inference.covariance import Rounding
 from ctid_cli.inference.criteria import HOLD_REJECTED, percent_from_r_squared, squared_innovations
 from ctid_cli.inference.fit import DeferredFields, Fit, InputFit, Status
 from ctid_cli.inference.innovations import NoiseFit, restricted_dispersion, steps_of
@@ -448,15 +448,14 @@ def fitted(
     residuals, law = samples.residuals, samples.linear
     given = _given(layout, measured)
     tangent = _tangent(layout, found, given)
-    hessian = np.sum([psi.T @ psi for psi in law.sensitivities], axis=0)
+    hessian = tangent.T @ np.sum([psi.T @ psi for psi in law.sensitivities], axis=0) @ tangent
     each = zip(law.sensitivities, law.residuals, strict=True)
-    gradient = np.sum([psi.T @ eps for psi, eps in each], axis=0)
+    gradient = tangent.T @ np.sum([psi.T @ eps for psi, eps in each], axis=0)
     equations = Equations(hessian, gradient, hessian, sum(float(eps @ eps) for eps in residuals), 0.0)
     count = sum(eps.size for eps in residuals)
     values = quality(equations, measured.spread, count)
     if robust is not None:
         values["cost"] = robust.cost(robust.losses) / count
-    values["condition_number"] = condition_number(tangent.T @ hessian @ tangent)
     states, offsets = measured.own(layout, theta)
     kind: Any = MultiInputFit if isinstance(model, MultiInputModel) else MeasuredFit
     fit: MeasuredFit = kind(

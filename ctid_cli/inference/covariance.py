@@ -22,7 +22,7 @@ SAMPLES_PER_PARAMETER, FEWEST = 5, 10
 #: Least share of the expected power of the residuals for which a noise is not scaled down. Measured: .4 to 2 for noise
 #: of the order of the model, 1e-6 to .02 for smooth disturbances of a building, where errors were 5 to 500 times too
 #: large.
-LEAST_SHARE = 0.3
+LEAST_POWER = 0.3
 #: Largest number of harmonics of a rounding error.
 HARMONICS = 50
 
@@ -172,7 +172,7 @@ def robust_dispersion(
     def covariance(noise: NoiseModel) -> Array:
         return np.asarray(np.sum([noise.covariance_of(block) for block in rows], axis=0))
 
-    share = min(1.0, _share_of_expected(scaled, errors, noise) / LEAST_SHARE)
+    share = min(1.0, _share_of_expected(scaled, errors, noise) / LEAST_POWER)
     middle = share * covariance(noise)
     with np.errstate(invalid="ignore"):  # near a unit root
         along = [share * (covariance(high) - covariance(low)) / (2 * STEP) for low, high in noise.displaced]
@@ -228,13 +228,13 @@ def _changing(
     squares = np.concatenate([noise.innovations(e)[order:] for e in errors]) ** 2
     if squares.size < SAMPLES_PER_PARAMETER * size or not variance > 0.0:
         return None
-    orthonormal = np.linalg.qr(g)[0]
-    leverage = np.sum(orthonormal**2, axis=1)
-    axes = np.linalg.eigh((orthonormal * leverage[:, None]).T @ orthonormal)[1]
+    basis = np.linalg.qr(g)[0]
+    leverage = np.sum(basis**2, axis=1)
+    axes = np.linalg.eigh((basis * leverage[:, None]).T @ basis)[1]
     slopes = np.concatenate([np.column_stack([noise.innovations(x)[order:] for x in block.T]) for block in columns])
     expected = 1.0 + np.sum(slopes * (slopes @ covariance / variance - 2.0 * g), axis=1)
     squares = squares / np.maximum(expected, 0.1)
-    tested = (orthonormal @ axes) ** 2
+    tested = (basis @ axes) ** 2
     tested = tested[:, np.sum(tested**2, axis=0) * FEWEST < 1.0]
     regressors = np.column_stack((np.ones(squares.size), squares.size * tested))
     weights, _, rank, _ = np.linalg.lstsq(regressors, squares, rcond=1e-8)

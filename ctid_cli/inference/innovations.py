@@ -32,7 +32,7 @@ Orders = tuple[int, int]
 MOST_CHOSEN, MOST_GIVEN = 3, 8
 #: Greatest inverse hyperbolic tangent of a partial correlation, which is then 1 - 1.7e-6.
 FARTHEST = 7.0
-#: The same for the restricted likelihood, with room for differences: the correlation is then 1 - 1.2e-5.
+#: The same for the restricted likelihood, of which differences are taken: the correlation is then 1 - 1.2e-5.
 RESTRICTED = 6.0
 #: Lags per coefficient of the long autoregression of Hannan and Rissanen's method, and least number of samples per lag.
 LONG_LAGS, SAMPLES_PER_LAG = 10, 10

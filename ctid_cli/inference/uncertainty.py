@@ -1,8 +1,8 @@
 """Standard errors and intervals of an estimate, for white or coloured noise."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,9 +142,9 @@ class Uncertainty:
             return cls("white", np.eye(len(covariance)), covariance)
         return cls("white", np.eye(len(covariance))[:, free], covariance[np.ix_(free, free)])
 
-    def of_samples(self, effective_count: float) -> "Uncertainty":
-        """Return the uncertainty with the degrees of freedom of a number of samples of white noise."""
-        freedom = max(LEAST_FREEDOM, effective_count - len(self.free_covariance))
+    def of_former(self, values: Mapping[str, Any]) -> "Uncertainty":
+        """Return the uncertainty with the degrees of freedom that a file of an earlier version gives as samples."""
+        freedom = max(LEAST_FREEDOM, float(values["effective_count"]) - len(self.free_covariance))
         return replace(self, variation=Dispersion.scaled(self.free_covariance, freedom).variation)
 
     @property

@@ -24,7 +24,6 @@ import ctid_cli
 from ctid_cli.canonical import content_hash, read_json
 from ctid_cli.errors import DataError
 from ctid_cli.inference.fit import DeferredFields
-from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.signals.files import file_sha256, require_file
 
 #: Maximum size of a file that is read [bytes]; ten thousand bootstrap draws need less.
@@ -253,9 +252,12 @@ def _instance(content: Any, kind: type, place: str) -> Any:
     values = {name: decoded(content[name], hint, f"{place}.{name}") for name, hint in hints.items() if name in content}
     late = dict.fromkeys(kind.deferred, ()) if issubclass(kind, DeferredFields) else {}
     found = kind(**values, **late)
-    if isinstance(found, Uncertainty) and "effective_count" in content:
-        return found.of_samples(_plain(content["effective_count"], float, place))
-    return found
+    # What a field of an earlier version says may be in another one now.
+    former = {name: content[name] for name in getattr(kind, "former", ()) if name in content}
+    try:
+        return found.of_former(former) if former and hasattr(found, "of_former") else found
+    except (TypeError, ValueError):
+        _refuse_part(place)
 
 
 def _plain(content: Any, hint: Any, place: str) -> Any:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
 from ctid_cli.estimators.delay_profile import DelayProfile
@@ -102,3 +103,5 @@ def test_files_of_earlier_versions_have_the_degrees_of_freedom_of_their_number_o
     content["effective_count"] = 33.0
     found = decoded(content, Uncertainty, "law")
     assert found.quantiles() == pytest.approx(student_quantile(30.0), rel=1e-9)
+    with pytest.raises(DataError, match="law is not what a fit has there"):
+        decoded(content | {"effective_count": "many"}, Uncertainty, "law")
