@@ -40,9 +40,8 @@ from .estimators.measured_submodels import MeasuredSubmodels as MeasuredSubmodel
 from .estimators.frequency_domain import FrequencyDomain as FrequencyDomain, FrequencyDomainSum as FrequencyDomainSum
 from .estimation.common import Bound as Bound, Fixed as Fixed
 from .estimators.identification import Identification as Identification
-from .identification.choice import Choice as Choice, Given as Given
+from .identification.choice import Candidate as Candidate, Choice as Choice, Given as Given
 from .identification.choose import choose as choose
-from .identification.criterion import Candidate as Candidate
 from .identification.identify import identify as identify
 from .identification.identify_response import identify_frequency_response as identify_frequency_response
 

@@ -6,15 +6,20 @@ from dataclasses import replace
 import numpy as np
 
 from ctid_cli.errors import DataError
+from ctid_cli.estimation.optimum.best_model import most_active
 from ctid_cli.filtering.filter_data import FilterData
-from ctid_cli.inference.signal_features import outliers
+from ctid_cli.inference.signal_features import input_moves, outliers
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import Record, named
+from ctid_cli.signals.record import Record, beginning, named
 from ctid_cli.signals.treatment import InputBefore
 
 #: Inputs are collinear if a combination of them, each scaled to length one, is shorter than the first number; inputs
 #: with a larger share in it than the second are named.
 COLLINEAR, INVOLVED = 1e-6, 1e-3
+#: Samples of all records to which models are fitted for a choice: what can be computed in ten seconds.
+PART = 2500
+#: The beginning of a record is used for the whole if input and output vary there by at least this share of all.
+LIVELY = 0.5
 
 
 def without_outliers(record: Record) -> Record:
@@ -88,3 +93,24 @@ def within_one_period(data: FilterData, period: float) -> FilterData:
         return data
     # Filters for regular clocks require one break per sample.
     return data._replace(tu=data.tu[within].copy(), u=data.u[within].copy(), interval=0.0)
+
+
+def parts_of(records: Sequence[Record]) -> tuple[list[Record], bool]:
+    """Return parts with at most ``PART`` samples in total, and whether all start at the beginning of their records."""
+    found = [_part(record, PART // len(records)) for record in records]
+    return [record for record, _ in found], all(from_start for _, from_start in found)
+
+
+def _part(record: Record, most: int) -> tuple[Record, bool]:
+    thinned = -(-record.n_samples // most)
+    if thinned > 1 and not record.several:
+        signal, y = record.input, record.bridged_y
+        if input_moves(record).kind in ("constant", "steps") or not np.array_equal(signal.t, record.t):
+            # The input changes rarely, and all changes are needed.
+            moves = np.append(True, np.diff(signal.values) != 0) | (signal.hold != "zoh")
+            held = HeldSignal(signal.t[moves], signal.values[moves], signal.hold)
+            return Record(record.t[::thinned], record.y[::thinned], held, name=record.name), True
+        if any(np.std(x[:most]) < LIVELY * np.std(x) for x in (signal.values, y)):
+            where = most_active(signal.values, y, most)
+            return part_of_record(record, where), where.start == 0
+    return beginning(record, most), True

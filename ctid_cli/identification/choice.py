@@ -1,21 +1,66 @@
-"""Options of a model and of the treatment of its records, given or chosen."""
+"""Options of a model and of the treatment of its records, given or chosen, and the models that are compared."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
 
 from ctid_cli.errors import OptionError
 from ctid_cli.estimation.common import Bound, Fixed
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
-from ctid_cli.identification.candidates import MOST_POLES, Span
-from ctid_cli.identification.criterion import Ranking, Searched
+from ctid_cli.estimators.measured_fit import MeasuredFit
+from ctid_cli.inference.criteria import InformationCriteria
+from ctid_cli.inference.noise_model import NoiseModel
 from ctid_cli.inference.response_test import ResponseTest
 from ctid_cli.models.additive import terms_text
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import AskedHold, Hold, Holds, InitialState, InputBefore, LossKind, Offset
 from ctid_cli.text import probability
 
+#: Options of the compared models: one transfer function, or a sum of submodels.
+Searched = DelayProfile | AdditiveOutputError
 #: Options that each of several inputs may have itself.
 OF_INPUTS = ("poles", "zeros", "integrators", "delay_bounds")
+#: Most poles, integrators included, unless more are asked for.
+MOST_POLES = 6
+#: Bounds at which a pair of poles is undamped, and radians of the record below which the free response of such a pair,
+#: which decays by less than a tenth, may be an oscillation of the noise.
+UNDAMPED, UNRESOLVED = frozenset({"least_damping", "imaginary"}), 100.0
+#: Poles (integrators included) and zeros of the structures with which settings of records are compared.
+SMALL = ((1, 0), (2, 1), (3, 2))
+
+
+class Span(NamedTuple):
+    """Ranges of the numbers of poles (without integrators) and zeros, and the numbers of integrators."""
+
+    poles: tuple[int, int] = (0, MOST_POLES)
+    zeros: tuple[int, int] = (0, MOST_POLES)
+    integrators: tuple[int, ...] = (0, 1)
+
+    def orders(self, unasked: bool) -> range:
+        """Return the numbers of poles, integrators included."""
+        most = self.poles[1] + max(self.integrators)
+        return range(1, (min(most, MOST_POLES) if unasked else most) + 1)
+
+    def structures(self, order: int, integrators: int, delay_free: bool) -> Iterator[tuple[int, int]]:
+        """Yield poles and zeros of all structures of an order, integrators included."""
+        poles = order - integrators
+        if max(self.poles[0], int(not integrators)) <= poles <= self.poles[1]:
+            for zeros in range(self.zeros[0], min(self.zeros[1], order - int(delay_free)) + 1):
+                yield poles, zeros
+
+    def small(self, integrators: int, delay_free: bool, most: int = len(SMALL)) -> list[tuple[int, int]]:
+        """Return small structures with which settings are compared; the smallest one if none is small."""
+        found = [
+            (order, each)
+            for order in self.orders(unasked=False)
+            for each in self.structures(order, integrators, delay_free)
+        ]
+        small = [each for order, each in found if (order, each[1]) in SMALL[:most]]
+        return small or [each for _, each in found[:1]]
 
 
 @dataclass(frozen=True)
@@ -92,22 +137,18 @@ class Given:
 
     @property
     def span(self) -> Span:
-        """Admitted structures; if degrees of single inputs are given, small ones to compare treatments."""
-        if self.modes is not None:
-            return Span(integrators=(self.integrators or 0,), modes=self.modes)
-        if self.typed:
-            own = [one.integrators for one in self.inputs or () if one.integrators is not None]
-            treated = None not in (self.initial_state, self.offset, self.delays_given) and self.hold != "auto"
-            # The smallest structure suffices if no treatment is to be chosen.
-            poles, zeros = ((1, 1), (0, 0)) if treated else ((1, 3), (0, 2))
-            return Span(poles, zeros, (max(own, default=self.integrators or 0),))
+        """Admitted structures of transfer functions with one number of poles and zeros."""
         poles, zeros = (
             (each, each) if isinstance(each, int) else each or (0, MOST_POLES) for each in (self.poles, self.zeros)
         )
         none = isinstance(self.poles, int) or self.offset in ("remove", "drift") or self.initial_state == "periodic"
         free = (0,) if none else (0, 1)
-        integrators = free if self.integrators is None else (self.integrators,)
-        return Span(poles, zeros, integrators, fixed=self.fixed, bounds=self.bounds)
+        return Span(poles, zeros, free if self.integrators is None else (self.integrators,))
+
+    @property
+    def single(self) -> bool:
+        """Whether one structure is given."""
+        return self.typed or (isinstance(self.poles, int) and isinstance(self.zeros, int) and self.modes is None)
 
     def check(self) -> None:
         """Raise an OptionError if given options contradict each other."""
@@ -134,6 +175,122 @@ class Given:
         )
 
 
+class HeldBack(NamedTuple):
+    """Errors of blocks of the records, each predicted by a fit without its outputs, beside those of another model."""
+
+    #: Fit of all blocks [%].
+    percent: float
+    #: Mean over the blocks of the logarithm of the ratio of their mean squared errors [-], and its standard error.
+    difference: float
+    standard_error: float
+    #: Whether the errors are not significantly larger than those of the models they are compared with.
+    acceptable: bool
+
+
+def zero_on_integrator(model: TransferFunction, length: float) -> float | None:
+    """Return the zero that nearly cancels an integrator over a record of a length [s]; None if there is none."""
+    zero = min(model.zeros.real[model.zeros.imag == 0.0], key=abs, default=np.inf)
+    return float(zero) if model.denominator[-1] == 0.0 and abs(zero) * length < 1.0 else None
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A model that is compared with others on the same samples.
+
+    Parameters
+    ----------
+    options : DelayProfile or AdditiveOutputError
+        Structure, range of the delay, and treatment of state and offset.
+    hold : {"zoh", "foh", "band-limited"}
+        Hold of the input.
+    fit : MeasuredFit
+        Fit with the least squared output error found, without standard errors.
+    size : int
+        Number of parameters, including those of each record.
+    criterion : float
+        Value of the criterion; only differences between candidates are meaningful.
+    criteria : InformationCriteria
+        AICc, BIC and FPE of the innovations.
+    held_back : HeldBack, optional
+        Errors of held-back blocks beside those of the candidate of least criterion, if they were computed.
+    """
+
+    options: Searched
+    hold: Holds
+    fit: MeasuredFit
+    size: int
+    criterion: float = float("nan")
+    criteria: InformationCriteria | None = None
+    held_back: HeldBack | None = None
+
+    @property
+    def name(self) -> str:
+        """Poles, zeros and integrators: ``2/1``, ``1/0 + 1`` or, for several inputs, ``3/1,2``; for a sum its terms."""
+        options = self.options
+        if isinstance(options, AdditiveOutputError):
+            return terms_text(options.terms)
+        integrators = f" + {options.integrators}" if options.integrators else ""
+        own = [options.zeros if one.zeros is None else one.zeros for one in options.inputs or ()]
+        zeros = ",".join(map(str, own)) if len(set(own)) > 1 else f"{own[0] if own else options.zeros}"
+        return f"{options.poles}/{zeros}{integrators}"
+
+    @property
+    def is_proper(self) -> bool:
+        """Whether all poles are finite, no pair may follow an oscillation of the noise, nor an integrator its drift."""
+        fit, box = self.fit, self.fit.box
+        if fit.poles_at_infinity or box is None:
+            return not fit.poles_at_infinity
+        length = 1.0 / box.spread[0]
+        if isinstance(fit.model, TransferFunction) and zero_on_integrator(fit.model, length) is not None:
+            return False
+        followed = [pole for pole in fit.held_poles if 0.0 < abs(pole.imag) * length < UNRESOLVED]
+        estimated = self.options.initial_state == "estimate"
+        return not any(UNDAMPED & set(box.met_by(pole)) for pole in followed if estimated)
+
+    @property
+    def structure(self) -> tuple[int, int]:
+        """Number of integrators, and number of poles with them."""
+        return self.options.integrators, self.options.order
+
+    def value(self, name: str) -> object:
+        """Return the hold of the input, or an option.
+
+        Parameters
+        ----------
+        name : str
+            ``hold``, or the name of an option.
+
+        Returns
+        -------
+        object
+            Its value.
+        """
+        return self.hold if name == "hold" else getattr(self.options, name)
+
+
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """Candidates by increasing criterion, and their noise model."""
+
+    candidates: tuple[Candidate, ...]
+    noise: NoiseModel
+
+    @property
+    def best(self) -> Candidate:
+        """Proper candidate of least criterion."""
+        return next((each for each in self.candidates if each.is_proper), self.candidates[0])
+
+    def of(self, **options: object) -> "Ranking | None":
+        """Return the candidates with these options; None if there are none."""
+        found = [each for each in self.candidates if all(each.value(name) == own for name, own in options.items())]
+        return Ranking(tuple(found), self.noise) if found else None
+
+    def runner_up(self, *names: str) -> Candidate | None:
+        """Return the first candidate that differs from the best in a named option, or None."""
+        best = [self.best.value(name) for name in names]
+        return next((each for each in self.candidates if [each.value(n) for n in names] != best), None)
+
+
 @dataclass(frozen=True, eq=False)
 class Choice:
     """A structure and a treatment, with the candidates from which they were chosen.
@@ -147,7 +304,9 @@ class Choice:
     fitted : tuple of Record
         These records, or parts of long ones, to which the candidates were fitted.
     ranking : Ranking
-        All structures of the grid, the best first.
+        All structures of the grid by increasing criterion.
+    taken : Candidate
+        The chosen one, which need not have the least criterion.
     answer : ResponseTest
         Test for a response of the outputs to the inputs.
     sentences : tuple of str
@@ -162,6 +321,7 @@ class Choice:
     records: tuple[Record, ...] = field(repr=False)
     fitted: tuple[Record, ...] = field(repr=False)
     ranking: Ranking = field(repr=False)
+    taken: Candidate = field(repr=False)
     answer: ResponseTest
     sentences: tuple[str, ...]
     gains: dict[str, tuple[float, ...]] = field(default_factory=dict)

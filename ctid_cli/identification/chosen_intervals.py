@@ -11,8 +11,7 @@ from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.measured_fit import fitted
 from ctid_cli.estimators.reported_parameters import determined, reported_parameters
-from ctid_cli.identification.choice import Choice
-from ctid_cli.identification.criterion import Candidate
+from ctid_cli.identification.choice import Candidate, Choice
 from ctid_cli.inference.intervals import NOT_DETERMINED, UncertainValue
 from ctid_cli.signals.record import with_hold
 from ctid_cli.signals.treatment import Holds
@@ -88,8 +87,8 @@ def with_other_gains(found: Identification, choice: Choice) -> Identification:
 
 
 def _larger(choice: Choice) -> Candidate | None:
-    """Return the best candidate with a pole more than the best one."""
-    best = choice.ranking.best
+    """Return the best candidate with a pole more than the chosen one."""
+    best = choice.taken
     return next(
         (
             each

@@ -1,217 +1,137 @@
-r"""Criterion by which models of the same samples are compared.
+"""Comparison of candidates: by a criterion of their innovations, and by the errors of held-back blocks."""
 
-Coloured noise makes the usual criteria favour too many parameters. One autoregressive model of the residuals of the
-closest fit, with the order of least BIC, whitens the residuals of all candidates; with V the sum of squared innovations
-of a candidate after one step of generalised least squares, N their number and p its number of parameters, it is
-
-.. math:: N \ln (V / N) + 1.5\,p \ln N .
-
-A noise model for each candidate would favour small models: the dynamics they miss are coloured, and would pass as
-noise.
-"""
-
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.estimators.additive_output_error import AdditiveOutputError
+from ctid_cli.arrays import Array, BoolArray, IntArray
+from ctid_cli.errors import CtidError
 from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit
-from ctid_cli.inference.covariance import LARGEST_CONDITION
+from ctid_cli.estimators.measured_fit import MeasuredFit, fitted
+from ctid_cli.identification.choice import Candidate, HeldBack, Ranking
 from ctid_cli.inference.criteria import (
-    InformationCriteria,
+    PENALTY,
     information_criteria,
     innovations_count,
+    percent_from_r_squared,
     squared_innovations,
 )
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
-from ctid_cli.models.additive import terms_text
-from ctid_cli.models.several_inputs import fractions_of
-from ctid_cli.signals.treatment import Holds
+from ctid_cli.inference.repetition import repetitions_of
+from ctid_cli.inference.signal_features import input_moves, resolution
+from ctid_cli.progress import reported
+from ctid_cli.signals.noise import ArmaNoise
+from ctid_cli.signals.record import Record, with_hold
 
-#: Options of the compared models: one transfer function, or a sum of submodels.
-Searched = DelayProfile | AdditiveOutputError
-#: Penalty of a parameter over that in BIC. For 134 simulated records of known structure, models so chosen had at most
-#: 1.25 times the error of the true structure in 87 %, with BIC itself in 84 %.
-PENALTY = 1.5
-#: Options of the treatment of records, and increase of the criterion from which one is rejected.
-TREATMENT, CLEARLY_WORSE = ("initial_state", "input_before", "offset"), 10.0
-#: Increase of the criterion up to which models with equal parameters are likely: 95 % of chi-square with one degree of
-#: freedom.
-LIKELY = 3.84
-#: Decrease of the criterion from which a drift is estimated.
-WORTH_A_DRIFT = 10.0
-#: Names of the bounds at which a pole pair follows an oscillation of this record's noise.
-UNDAMPED = frozenset({"least_damping", "imaginary"})
+#: Blocks of all records, each held back once, and least number of each record; groups of blocks that are held back
+#: together.
+BLOCKS, FEWEST_BLOCKS, FOLDS = 10, 2, 5
+#: Share of the least mean squared error of all blocks that each of them has at least: quiet blocks do not decide.
+LEAST_SHARE = 0.1
+#: Standard errors above the least errors of held-back blocks up to which others are acceptable.
+FARTHEST = 2.0
+#: Correlation of residuals one period later that chance gives, in standard deviations.
+CHANCE = 2.0
 
 
-class Errors(NamedTuple):
-    """Output errors of records, and their derivatives with respect to the parameters of a least-squares step."""
+def ranked(
+    candidates: Sequence[Candidate], records: Sequence[Record], group: Callable[[Candidate], Hashable] | None = None
+) -> Ranking:
+    """Rank candidates, fitted to the same samples, by their criterion.
 
-    residuals: Sequence[Array]
-    slopes: Sequence[Array]
-
-    @classmethod
-    def of(cls, fit: MeasuredFit) -> "Errors":
-        """Return those of a fit."""
-        return cls(fit.residuals, [psi @ fit.tangent for psi in fit.sensitivities])
-
-    def innovations(self, noise: NoiseModel) -> tuple[float, int]:
-        """Return the sum of squared innovations after one step, and their number."""
-        return squared_innovations(*self, noise), innovations_count(self.residuals, noise)
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A model that is compared with others on the same samples.
-
-    Parameters
-    ----------
-    options : DelayProfile or AdditiveOutputError
-        Structure, range of the delay, and treatment of state and offset.
-    hold : {"zoh", "foh", "band-limited"}
-        Hold of the input.
-    fit : MeasuredFit
-        Fit with the least squared output error found, without standard errors.
-    size : int
-        Number of parameters, including those of each record.
-    criterion : float
-        Value of the criterion; only differences between candidates are meaningful.
-    criteria : InformationCriteria
-        AICc, BIC and FPE of the innovations.
-    prediction_ratio : float
-        Mean squared error of held-back blocks of the records, over that of the fit; NaN if it was not computed.
-    predicts : bool
-        Whether ``prediction_ratio`` is similar to that of smaller structures.
+    One step of generalised least squares from the fit promises a sum of squared innovations, which need not exist. The
+    least one of each group is therefore computed by a search.
     """
-
-    options: Searched
-    hold: Holds
-    fit: MeasuredFit
-    size: int
-    criterion: float = float("nan")
-    criteria: InformationCriteria = field(default_factory=lambda: information_criteria(np.nan, 1, 0))
-    prediction_ratio: float = float("nan")
-    predicts: bool = True
-
-    @property
-    def is_admissible(self) -> bool:
-        """Whether the data determine it, no pole pair is at a bound of ``UNDAMPED``, and it predicts."""
-        box, held = self.fit.box, self.fit.held_poles
-        undamped = box is not None and any(UNDAMPED.intersection(box.met_by(pole)) for pole in held)
-        return self.predicts and self.fit.condition_number <= LARGEST_CONDITION and not undamped
-
-    @property
-    def name(self) -> str:
-        """Poles, zeros and integrators: ``2/1``, ``1/0 + 1`` or, for several inputs, ``3/1,2``; for a sum its terms."""
-        options = self.options
-        if isinstance(options, AdditiveOutputError):
-            return terms_text(options.terms)
-        integrators = f" + {options.integrators}" if options.integrators else ""
-        own = [options.zeros if one.zeros is None else one.zeros for one in options.inputs or ()]
-        zeros = ",".join(map(str, own)) if len(set(own)) > 1 else f"{own[0] if own else options.zeros}"
-        return f"{options.poles}/{zeros}{integrators}"
-
-    def value(self, name: str) -> object:
-        """Return the hold of the input, or an option.
-
-        Parameters
-        ----------
-        name : str
-            ``hold``, or the name of an option.
-
-        Returns
-        -------
-        object
-            Its value.
-        """
-        return self.hold if name == "hold" else getattr(self.options, name)
-
-
-@dataclass(frozen=True, eq=False)
-class Ranking:
-    """Candidates by increasing criterion, inadmissible ones last, and their noise model."""
-
-    candidates: tuple[Candidate, ...]
-    noise: NoiseModel
-
-    @property
-    def best(self) -> Candidate:
-        """First candidate."""
-        return self.candidates[0]
-
-    def of(self, **options: object) -> "Ranking | None":
-        """Return the candidates with these options; None if there are none."""
-        found = [each for each in self.candidates if all(each.value(name) == own for name, own in options.items())]
-        return Ranking(tuple(found), self.noise) if found else None
-
-    def runner_up(self, *names: str) -> Candidate | None:
-        """Return the first candidate that is not better than the best and differs in a named option, or None."""
-        others = (each for each in self.candidates if any(each.value(n) != self.best.value(n) for n in names))
-        return next((each for each in others if each.criterion >= self.best.criterion), None)
-
-
-def without_needless_drift(ranking: Ranking) -> Ranking:
-    """Return the candidates without a drift of the output, unless it lowers the criterion by ``WORTH_A_DRIFT``.
-
-    A needless drift may describe a part of the response: in one case it replaced an integrator, with 8.6 times the
-    error. The estimated offset of an integrator is a drift too, and needs no lead.
-    """
-    others = tuple(each for each in ranking.candidates if each.options.offset != "drift")
-    constant = [each.criterion for each in others if not each.options.integrators]
-    if not others or ranking.best.criterion < min(constant, default=-np.inf) - WORTH_A_DRIFT:
-        return ranking
-    return replace(ranking, candidates=others)
-
-
-def gains_of_treatments(ranking: Ranking) -> dict[str, tuple[float, ...]]:
-    """Return the static gains of treatments that are not clearly worse than the best, if their signs differ."""
-    best_of: dict[tuple[object, ...], Candidate] = {}
-    for each in ranking.candidates:
-        if each.is_admissible and each.criterion <= ranking.best.criterion + CLEARLY_WORSE:
-            best_of.setdefault(tuple(each.value(name) for name in TREATMENT), each)
-    found: dict[str, list[float]] = {}
-    for each in best_of.values():
-        names = list(each.fit.model.parts) if isinstance(each.fit, MultiInputFit) else [""]
-        for name, model in zip(names, fractions_of(each.fit.model), strict=False):
-            if np.isfinite(model.dc_gain):
-                found.setdefault(f"{name}_static_gain" if name else "static_gain", []).append(float(model.dc_gain))
-    return {name: tuple(gains) for name, gains in found.items() if min(gains) < 0.0 < max(gains)}
-
-
-def holds_not_rejected(ranking: Ranking) -> tuple[Holds, ...]:
-    """Return the holds whose best candidate is within ``LIKELY`` of the best one, without that of the best."""
-    each = {one.hold: one.criterion for one in reversed(ranking.candidates) if one.is_admissible}
-    best = ranking.best
-    return tuple(hold for hold, own in each.items() if hold != best.hold and own <= best.criterion + LIKELY)
-
-
-def ranked(candidates: Sequence[Candidate]) -> Ranking:
-    """Rank candidates by their criterion; all must have been fitted to the same samples."""
-    closest = min(candidates, key=lambda each: (not each.is_admissible, each.fit.cost))
+    closest = min(candidates, key=lambda each: (not each.is_proper, each.fit.cost))
     noise = noise_of(closest.fit.residuals)
-    return Ranking(in_order([_with_criterion(each, noise) for each in candidates]), noise)
+    share = independent_share(closest.fit, records)
+    found = [_with_criterion(each, noise, share) for each in candidates]
+    if group is not None and noise.order:
+        groups: dict[Hashable, list[Candidate]] = {}
+        for each in found:
+            groups.setdefault(group(each), []).append(each)
+        found = [each for own in groups.values() for each in _realised(own, records, noise, share)]
+    return Ranking(tuple(sorted(found, key=lambda each: each.criterion)), noise)
 
 
-def in_order(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """Return candidates by increasing criterion, inadmissible ones last."""
-    return tuple(sorted(candidates, key=lambda each: (not each.is_admissible, each.criterion)))
+def _with_criterion(candidate: Candidate, noise: NoiseModel, share: float, squared: float | None = None) -> Candidate:
+    fit = candidate.fit
+    if squared is None:
+        squared = squared_innovations(fit.residuals, [psi @ fit.tangent for psi in fit.sensitivities], noise)
+    count = innovations_count(fit.residuals, noise)
+    criteria = information_criteria(squared, count, candidate.size)
+    criterion = penalised(squared / count, share * count, candidate.size)
+    return replace(candidate, criterion=criterion, criteria=criteria)
+
+
+def independent_share(fit: MeasuredFit, records: Sequence[Record]) -> float:
+    """Return the share of the samples of records that count if a part of their residuals repeats with the input.
+
+    A rounding or a nonlinearity has the same error in all of P periods of the input: if a share r of the variance
+    repeats, the means over periods have the variance of N / (1 + (P - 1) r) independent residuals.
+    """
+    repeated, periods = [], []
+    for record, e, use in zip(records, fit.residuals, fit.used, strict=True):
+        step, found = record.interval, () if record.several else repetitions_of(record.input, record.t)
+        if step is None or not found or not e.any():
+            return 1.0
+        shift = min(found, key=lambda each: each.shift)
+        lag, whole = round(shift.shift / step), np.full(use.size, np.nan)
+        whole[use] = e
+        pairs = shift.sign * whole[lag:] * whole[: whole.size - lag]
+        repeated.append(float(np.nanmean(pairs) / np.mean(e**2)) - CHANCE / np.sqrt(e.size))
+        periods.append(e.size / lag)
+    return 1.0 / (1.0 + (float(np.mean(periods)) - 1.0) * max(float(np.mean(repeated)), 0.0))
+
+
+def _realised(
+    candidates: Sequence[Candidate], records: Sequence[Record], noise: NoiseModel, share: float
+) -> list[Candidate]:
+    """Return candidates of which the least criterion is that of a model."""
+    promised, found = sorted(candidates, key=lambda each: each.criterion, reverse=True), list[Candidate]()
+    while promised and (not found or promised[-1].criterion < min(each.criterion for each in found)):
+        each = promised.pop()
+        found.append(_with_criterion(each, noise, share, _innovations(each, records, noise)))
+    return found + promised
+
+
+def _innovations(candidate: Candidate, records: Sequence[Record], noise: NoiseModel) -> float:
+    """Return the sum of squared innovations of the generalised least-squares estimate in the basin of a fit."""
+    fit, own = candidate.fit, tuple(noise.coefficients.tolist())
+
+    def squared(errors: Sequence[Array]) -> float:
+        return sum(float(np.sum(noise.innovations(e)[noise.order :] ** 2)) for e in errors)
+
+    at_fit = squared(fit.residuals)
+    laid_out = candidate.options.prepare([with_hold(record, candidate.hold) for record in records]).laid_out
+    try:
+        white = laid_out.whitened_by(ArmaNoise((1.0,), own, innovation_variance=1.0))
+        return min(squared(white.errors(white.local(white.begin(fit.parametrised)))), at_fit)
+    except (CtidError, np.linalg.LinAlgError):
+        # The fit itself is such a model.
+        return at_fit
 
 
 def criteria_of(
-    models: Sequence[Errors], used: Sequence[Sequence[BoolArray]], parameters: Sequence[int]
+    models: Sequence[Sequence[Array]], used: Sequence[Sequence[BoolArray]], parameters: Sequence[int]
 ) -> list[float]:
-    """Return the criterion of models at the samples that all use, with the noise model of the closest one."""
+    """Return the criterion of output errors at the samples that all models use, with the noise of the least ones."""
     common = [np.logical_and.reduce(uses) for uses in zip(*used, strict=True)]
-    kept = []
-    for model, own in zip(models, used, strict=True):
-        places = [mask[use] for mask, use in zip(common, own, strict=True)]
-        kept.append(Errors(*([x[at] for x, at in zip(part, places, strict=True)] for part in model)))
-    noise = noise_of(min((each.residuals for each in kept), key=lambda errors: sum(float(e @ e) for e in errors)))
-    return [penalised(*each.innovations(noise), size) for each, size in zip(kept, parameters, strict=True)]
+    kept = [
+        [e[mask[use]] for e, mask, use in zip(errors, common, own, strict=True)]
+        for errors, own in zip(models, used, strict=True)
+    ]
+    noise = noise_of(min(kept, key=lambda errors: sum(float(e @ e) for e in errors)))
+    return [
+        penalised(squared / count, count, size)
+        for squared, count, size in zip(
+            (squared_innovations(errors, [np.zeros((e.size, 0)) for e in errors], noise) for errors in kept),
+            (innovations_count(errors, noise) for errors in kept),
+            parameters,
+            strict=True,
+        )
+    ]
 
 
 def noise_of(residuals: Sequence[Array]) -> NoiseModel:
@@ -219,14 +139,134 @@ def noise_of(residuals: Sequence[Array]) -> NoiseModel:
     return fit_noise_model(residuals, penalty=float(np.log(sum(block.size for block in residuals))))
 
 
-def _with_criterion(candidate: Candidate, noise: NoiseModel) -> Candidate:
-    squared, count = Errors.of(candidate.fit).innovations(noise)
-    criteria = information_criteria(squared, count, candidate.size)
-    return replace(candidate, criterion=penalised(squared, count, candidate.size), criteria=criteria)
+def penalised(mean_square: float, count: float, parameters: int) -> float:
+    """Return the criterion of a number of innovations with a mean square."""
+    logarithm = float(np.log(max(mean_square, np.finfo(float).tiny)))
+    return count * logarithm + PENALTY * parameters * float(np.log(count))
 
 
-def penalised(squared: float, count: int, parameters: int) -> float:
-    """Return the criterion of squared innovations."""
-    return count * float(np.log(max(squared, np.finfo(float).tiny) / count)) + PENALTY * parameters * float(
-        np.log(count)
-    )
+# --- held-back blocks ----------------------------------------------------------------------------------
+
+
+def judged(ranking: Ranking, records: Sequence[Record]) -> tuple[Ranking, Candidate]:
+    """Return candidates with the errors of held-back blocks of the best one of each order, and the one to take."""
+    proper = [each for each in ranking.candidates if each.is_proper] or list(ranking.candidates)
+    best, first = proper[0], dict[Hashable, Candidate]()
+    for each in proper:
+        first.setdefault(each.structure, each)
+    tried = [best, *(each for each in first.values() if each.size < best.size)]
+    found = {id(each): each for each in ranking.candidates}
+    if len(tried) > 1:
+        compared = held_back([(each, records) for each in tried])
+        found |= {id(each): replace(each, held_back=own) for each, own in zip(tried, compared, strict=True)}
+    accepted = [own for each in tried if (own := found[id(each)]).held_back is not None and own.held_back.acceptable]
+    taken = min(accepted, key=lambda each: (each.size, each.criterion), default=best)
+    steps = all(input_moves(each).kind in ("constant", "steps") for record in records for each in record.each_input)
+    if steps and best.options.initial_state == "rest":
+        # The blocks of a few responses do not tell the order of a model.
+        taken = next(found[id(each)] for each in proper if each.options.integrators == taken.options.integrators)
+    return replace(ranking, candidates=tuple(found[id(each)] for each in ranking.candidates)), taken
+
+
+@reported("held-back blocks")
+def held_back(candidates: Sequence[tuple[Candidate, Sequence[Record]]]) -> list[HeldBack | None]:
+    """Return the errors of held-back blocks of models fitted to the same outputs, None where a fit fails.
+
+    They are acceptable if they are not larger than those of the first model by more than a standard error, nor than the
+    least ones by more than two.
+    """
+    used = [np.logical_and.reduce(uses) for uses in zip(*(each.fit.used for each, _ in candidates), strict=True)]
+    blocks = block_numbers(used)
+    errors = [_block_errors(each, records, blocks) for each, records in candidates]
+    outputs = [record.y[use] for record, use in zip(candidates[0][1], used, strict=True)]
+    if errors[0] is None:
+        return [None] * len(errors)
+    steps = [resolution(y) ** 2 / 12 for y in outputs]
+    least = LEAST_SHARE * min(float(squared.mean()) for squared in errors if squared is not None)
+    floor = np.maximum(np.repeat(steps, _blocks_each(used)), least)
+    sizes = [None if squared is None else np.log(np.maximum(squared, floor)) for squared in errors]
+    lowest = min((size for size in sizes if size is not None), key=lambda size: float(size.mean()))
+    total = float(np.mean(np.concatenate([y - y.mean() for y in outputs]) ** 2))
+    found: list[HeldBack | None] = []
+    for squared, size in zip(errors, sizes, strict=True):
+        if squared is None or size is None or sizes[0] is None:
+            found.append(None)
+            continue
+        percent = percent_from_r_squared(1.0 - float(squared.mean()) / total)
+        first, least_ones = (_difference(size, other) for other in (sizes[0], lowest))
+        acceptable = first[0] <= first[1] and least_ones[0] <= FARTHEST * least_ones[1]
+        found.append(HeldBack(percent, *first, acceptable))
+    return found
+
+
+def _difference(one: Array, other: Array) -> tuple[float, float]:
+    """Return the mean difference of blocks and its standard error."""
+    ratios = one - other
+    return float(ratios.mean()), float(ratios.std(ddof=1) / np.sqrt(ratios.size))
+
+
+def block_numbers(used: Sequence[BoolArray]) -> list[IntArray]:
+    """Return the number of the block of each sample of each record, -1 for samples that are never held back.
+
+    These are the first used ones, from which the initial state is estimated.
+    """
+    found = []
+    for use in used:
+        numbers = np.full(use.size, -1)
+        count = int(np.count_nonzero(use))
+        numbers[use] = np.arange(count) * (_blocks_each(used) + 1) // max(count, 1) - 1
+        found.append(numbers)
+    return found
+
+
+def _blocks_each(records: Sequence[object]) -> int:
+    return max(FEWEST_BLOCKS, -(-BLOCKS // len(records)))
+
+
+def _block_errors(candidate: Candidate, records: Sequence[Record], blocks: Sequence[IntArray]) -> Array | None:
+    """Return the mean squared errors of all blocks; None if a fit fails."""
+    try:
+        errors = held_back_errors(candidate, records, blocks)
+    except CtidError:
+        return None
+    pairs = [
+        (own, numbers == k) for own, numbers in zip(errors, blocks, strict=True) for k in range(_blocks_each(blocks))
+    ]
+    squared = np.array([float(np.mean(own[at] ** 2)) if at.any() else np.nan for own, at in pairs])
+    return squared if np.isfinite(squared).all() else None
+
+
+def held_back_errors(candidate: Candidate, records: Sequence[Record], blocks: Sequence[IntArray]) -> list[Array]:
+    """Return the errors of all blocks, each from a fit without its outputs; NaN elsewhere, shape (N,) each.
+
+    Input and state are simulated through a held-back block. Fits start at that to the whole records. The last group of
+    blocks that are held back together has the ends of all records.
+    """
+    options, each = candidate.options, _blocks_each(blocks)
+    last = each - -(-each // FOLDS)
+    whole = options.prepare(records).laid_out
+    errors = [np.full(record.n_samples, np.nan) for record in records]
+    for number in range(FOLDS):
+        held = [
+            (own >= 0) & (np.where(own >= last, FOLDS - 1, (own + k * each) % (FOLDS - 1)) == number)
+            for k, own in enumerate(blocks)
+        ]
+        if not any(out.any() for out in held):
+            continue
+        pairs = zip(records, held, strict=True)
+        fit = refitted(candidate, [replace(record, y=np.where(out, np.nan, record.y)) for record, out in pairs]).fit
+        outputs = options._simulated(fit, whole), whole.used(), fit.offsets
+        for error, out, record, simulated, use, offset in zip(errors, held, records, *outputs, strict=True):
+            known = np.full(record.n_samples, np.nan)
+            known[use] = record.y[use] - simulated - (offset if options.offset == "remove" else 0.0)
+            error[out] = known[out]
+    return errors
+
+
+def refitted(candidate: Candidate, records: Sequence[Record]) -> Candidate:
+    """Return a candidate fitted to other records, near its model."""
+    options = candidate.options
+    laid_out = options.prepare(records).laid_out
+    if isinstance(options, DelayProfile) and options.bounds:
+        return replace(candidate, fit=options._minimum(laid_out, None))
+    return replace(candidate, fit=fitted(laid_out, laid_out.local(laid_out.begin(candidate.fit.parametrised)), None))

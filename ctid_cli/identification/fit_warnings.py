@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from ctid_cli.arrays import BoolArray
+from ctid_cli.errors import DataError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Identification, unsafe_intervals
 from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit, delay_names
 from ctid_cli.estimators.reported_parameters import direction_names, free_directions
-from ctid_cli.identification.candidates import zero_on_integrator
-from ctid_cli.identification.changes import Kind
-from ctid_cli.identification.remedies import Remedy, Trials, tried_remedies
+from ctid_cli.identification.choice import Candidate, Given, fit_options, zero_on_integrator
+from ctid_cli.identification.choose import choose
+from ctid_cli.identification.criterion import held_back, refitted
 from ctid_cli.identification.sentences import outlying, spelled
 from ctid_cli.inference.covariance import LARGE_STANDARD_ERROR, describe_conditioning
 from ctid_cli.inference.fit import Status
@@ -22,7 +23,7 @@ from ctid_cli.inference.signal_features import growth_time, residual_outliers, s
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.several_inputs import delays_of, fractions_of
 from ctid_cli.progress import reported
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, with_hold
 from ctid_cli.text import count, listed, probability
 
 #: Why residuals may depend on later inputs.
@@ -45,14 +46,14 @@ SLOW = 0.6
 LISTED = 3
 
 
-def with_warnings(found: Identification, time_unit: str = "s") -> Identification:
-    """Try changes of a fit on its records, and return it with its warnings."""
-    return replace(found, warnings=tuple(f"{text}." for text in fit_warnings(found, time_unit)))
+def with_warnings(found: Identification, time_unit: str = "s", free: Given | None = None) -> Identification:
+    """Return a fit with its warnings; one with a given structure is compared with a choice by other options."""
+    return replace(found, warnings=tuple(f"{text}." for text in fit_warnings(found, time_unit, free)))
 
 
 @reported("tests of the fit")
-def fit_warnings(found: Identification, time_unit: str = "s") -> list[str]:
-    """Return the warnings of a fit without their full stops, the most important first, and try changes of it."""
+def fit_warnings(found: Identification, time_unit: str = "s", free: Given | None = None) -> list[str]:
+    """Return the warnings of a fit without their full stops, the most important first."""
     fit, records = found.fit, found.records
     growing = [
         growth_time(record.t[use], record.y[use], signal.at(record.t[use]))
@@ -67,56 +68,53 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[str]:
         loop = ". In a loop the plant may be unstable: that needs the controller (--loop FILE), or --unstable"
         unfinished = fit.status.value.removesuffix(".")
         return [f"{unfinished}{loop * any(record.loop is not None for record in records)}"]
-    detected = found.answer.seen
-    suspicious = (
-        fit.fit_percent < LOW_FIT
-        or fit.status is not Status.CONVERGED
-        or len(found.tests) < len(records) * len(delays_of(fit.model))
-    )
+    suspicious = not found.answer.seen or fit.fit_percent < LOW_FIT or fit.status is not Status.CONVERGED
     suspicious |= not all(test.white and test.uncorrelated for test in found.tests)
-    tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=detected)
-    named = [f"{_observed(remedy, found, time_unit)}: {remedy}" for remedy in tried.remedies]
-    remedied = {remedy.kind for remedy in tried.remedies}
-    if not detected:
+    chosen = [] if free is None or not suspicious else list(_of_choice(found, free, time_unit))
+    if not found.answer.seen:
         no_model = f"No model: no response of the output to the input is detected ({probability(found.answer.p_value)})"
-        return [f"{no_model}. {found.answer.evidence[:-1]}", *named]
-    others = [*of_lost_poles(fit), *_of_residuals(found, remedied, time_unit)]
-    if not named:
-        # The search and the errors of an estimate that will change are not reported.
-        others += [
-            *_of_noise(fit),
-            *_of_fit(fit, tried),
-            *of_search(fit, time_unit),
-            *_of_uncertainty(found, time_unit),
-        ]
+        return [f"{no_model}. {found.answer.evidence[:-1]}", *chosen]
+    others = [
+        *of_lost_poles(fit),
+        *_of_residuals(found, time_unit),
+        *_of_noise(fit),
+        *_of_fit(fit),
+        *of_search(fit, time_unit),
+        *_of_uncertainty(found, time_unit),
+    ]
     changed = [] if fit.change is None else [fit.change.sentence]
-    return list(dict.fromkeys([*_of_validation(found), *named, *changed, *others]))[:MOST]
+    return list(dict.fromkeys([*_of_validation(found), *chosen, *changed, *others]))[:MOST]
 
 
 def _used(found: Identification) -> Iterator[tuple[Record, BoolArray]]:
     return zip(found.records, found.fit.linear.used, strict=True)
 
 
-# --- observations with a remedy ----------------------------------------------------------------------
+# --- observations ------------------------------------------------------------------------------------
 
 
-def _observed(remedy: Remedy, found: Identification, time_unit: str) -> str:
-    """Return the observation that a kind of remedy addresses."""
-    fit, options = found.fit, found.options
-    if remedy.kind == "loss":
-        return _outliers(found, time_unit)
-    if remedy.kind == "hold":
-        return f"The input is taken with --hold {' --hold '.join(found.records[0].hold_options)}"
-    if remedy.kind == "treatment":
-        return f"The fit is made with --initial-state {options.initial_state} --offset {options.offset}"
-    if remedy.kind == "delay" and (ends := [each for each in _delays_at_ends(fit, time_unit) if "end of" in each]):
-        return ends[0]
-    low, high = options.delay_bounds
-    if remedy.kind == "delay" and low == high:
-        return f"The delay is taken as {low:g} {time_unit}"
-    if "--integrators" in remedy.option and (slow := _slow_pole(found, time_unit)):
-        return slow
-    return _dependence(found) or f"The model has {spelled(options)}"
+def _of_choice(found: Identification, free: Given, time_unit: str) -> Iterator[str]:
+    """Yield what would be chosen if the structure were free, if it predicts held-back blocks better."""
+    options, fit = found.options, found.fit
+    # In a loop the reference drives the response; a part of the records may begin later than they do.
+    if not isinstance(options, DelayProfile) or fit.noise is not None or fit.weighting is not None:
+        return
+    try:
+        choice = choose(found.records, free, time_unit)
+    except DataError as error:
+        yield f"No structure could be chosen for comparison: {str(error).removesuffix('.')}"
+        return
+    records = choice.fitted
+    moved = any(part.t[0] > record.t[0] for part, record in zip(records, found.records, strict=True))
+    treated = replace(options, initial_state="estimate", input_before=None) if moved else options
+    held = [with_hold(record, found.records[0].hold) for record in records]
+    given = refitted(Candidate(treated, found.records[0].hold, fit, choice.taken.size), held)
+    other, own = held_back([(refitted(choice.taken, records), records), (given, held)])
+    if choice.has_model and own is not None and other is not None and not own.acceptable:
+        before = fit_options(options, found.records[0])
+        words = " ".join(text for text in fit_options(choice.options, choice.records[0]) if text not in before)
+        chosen = f"A free choice takes {spelled(choice.options)}: with {words}"
+        yield f"{chosen} the held-back fit is {other.percent:.1f} instead of {own.percent:.1f} %"
 
 
 def _dependence(found: Identification, least: float = 0.05) -> str:
@@ -176,9 +174,6 @@ def _of_cancelled_integrator(found: Identification, time_unit: str) -> Iterator[
             yield f"{what}, which describes a drift of the output; without both the static gain is {gain:.3g}"
 
 
-# --- observations without a remedy -------------------------------------------------------------------
-
-
 def _of_validation(found: Identification) -> Iterator[str]:
     fit, other = found.fit, found.validation
     if other is None:
@@ -192,12 +187,12 @@ def _of_validation(found: Identification) -> Iterator[str]:
         yield f"{what}: the model does not generalise, or there is more noise"
 
 
-def _of_residuals(found: Identification, remedied: set[Kind], time_unit: str) -> Iterator[str]:
+def _of_residuals(found: Identification, time_unit: str) -> Iterator[str]:
     """Yield warnings about residuals and outputs."""
-    if not remedied & {"structure", "delay", "hold"} and (what := _dependence(found, DEPENDENT)):
+    if what := _dependence(found, DEPENDENT):
         yield f"{what}: {AHEAD if 'later values' in what else 'the model misses a part of the response'}"
     outliers = _outliers(found, time_unit)
-    if outliers and "loss" not in remedied:
+    if outliers:
         yield outliers
     share = max(saturated(record.y[record.valid]) for record in found.records)
     if share:
@@ -225,13 +220,10 @@ def _of_residuals(found: Identification, remedied: set[Kind], time_unit: str) ->
             yield f"{where}, as in a loop, where noise biases the estimate, or as if the output is ahead of the input"
 
 
-def _of_fit(fit: MeasuredFit, tried: Trials) -> Iterator[str]:
-    """Yield that a fit is low, as it always is with outliers, and which changes did not raise it."""
+def _of_fit(fit: MeasuredFit) -> Iterator[str]:
+    """Yield that a fit is low, as it always is with outliers."""
     if fit.fit_percent < LOW_FIT and fit.weighting is None and fit.noise is None:
-        what = f"The fit is {fit.fit_percent:.1f} %: {100 * (1 - fit.r2):.2g} % of the output's variance is left"
-        words = (word for option in tried.without_gain for word in option.split())
-        names = list(dict.fromkeys(word for word in words if word.startswith("--")))
-        yield f"{what}; tried without gain: other values of {listed(names)}" if names else what
+        yield f"The fit is {fit.fit_percent:.1f} %: {100 * (1 - fit.r2):.2g} % of the output's variance is left"
 
 
 def _of_noise(fit: MeasuredFit) -> Iterator[str]:

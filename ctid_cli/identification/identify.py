@@ -88,7 +88,9 @@ def identify(
     if options is not None and not isinstance(options, Given):
         found = identification.identify(options, several, validation, *noise)
         likely = found.fit.assumed_hold.others if found.fit.assumed_hold else ()
-        return with_warnings(joined_with_holds(found, likely), time_unit)
+        before = getattr(options, "input_before", None)
+        freely = Given(hold=several[0].hold, input_before=before if isinstance(before, float | int) else None)
+        return with_warnings(joined_with_holds(found, likely), time_unit, freely)
     given = options or Given()
     choice = choose(several, given, time_unit)
     if given.poles is None and not choice.has_model:
@@ -108,4 +110,6 @@ def identify(
         found = joined_with_larger(found, choice)
     if other is not None:
         found = replace(found, validation=validated_on(other, choice.options, found.fit, given))
-    return with_warnings(found, time_unit)
+    typed = given.typed or isinstance(given.poles, int)
+    free = Given(hold=given.hold, input_before=given.input_before, loss=given.loss) if typed else None
+    return with_warnings(found, time_unit, free)

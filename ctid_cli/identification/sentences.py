@@ -3,8 +3,8 @@
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.identification import Options
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
-from ctid_cli.identification.choice import Given
-from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking, Searched
+from ctid_cli.identification.choice import MOST_POLES, Candidate, Given, Ranking, Searched
+from ctid_cli.inference.criteria import PENALTY
 from ctid_cli.text import count, listed
 
 #: Sentence if the beginning of a record is not used.
@@ -48,12 +48,13 @@ def of_outliers(number: int) -> str:
     return f"Loss: tukey (--loss), as {outlying(number)}; all else is chosen without {'it' if number == 1 else 'them'}."
 
 
-def rest_assumed(options: Searched) -> str:
-    """State that rest is assumed."""
-    return (
-        f"State before the record: {_state(options)}; this is assumed, as the input does not change enough after the "
-        "longest delay to estimate a state."
-    )
+def rest_assumed(options: Searched, quiet: bool) -> str:
+    """State that rest is assumed, and why."""
+    if quiet:
+        why = "the output is constant until the input changes"
+    else:
+        why = "this is assumed, as the input does not change enough after the longest delay to estimate a state"
+    return f"State before the record: {_state(options)}; {why}."
 
 
 def of_state(rest: Candidate, estimated: Candidate, likely: bool) -> str:
@@ -79,24 +80,36 @@ def _state(options: Searched) -> str:
 def of_setting(models: Ranking, name: str) -> str:
     """Describe the offset or the hold."""
     other = models.runner_up(name)
-    fall = "nothing else could be tried" if other is None else _below(models, other, other.value(name))
+    fall = "nothing else could be tried"
+    if other is not None:
+        fall = f"{_lower(models.best, other)} than with the runner-up, {other.value(name)}"
     return f"{name.capitalize()}: {models.best.value(name)} (--{name}); {fall}."
 
 
-def of_drift(ranking: Ranking) -> str:
-    """Describe a drift instead of an integrator."""
-    best, other = ranking.candidates
-    return f"Offset: drift (--offset), as a zero nearly cancels the integrator otherwise; {_lower(best, other)}."
-
-
-def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
+def of_grid(ranking: Ranking, taken: Candidate, delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
     """Describe the structure and the range of the delay."""
-    best = ranking.best
-    other = ranking.runner_up("poles", "zeros", "integrators")
-    found = []
-    if other is not None:
-        found.append(f"Structure: {spelled(best.options)}; {_below(ranking, other, spelled(other.options))}.")
-    return found + _too_large(ranking) + of_range(delays, given, time_unit)
+    best, found = ranking.best, list[str]()
+    others = [each for each in ranking.candidates if each.fit is not taken.fit and not each.fit.poles_at_infinity]
+    if taken.held_back is not None and taken.fit is not best.fit:
+        beside = next(each for each in ranking.candidates if each.held_back and each.held_back.difference == 0.0)
+        assert beside.held_back is not None
+        fits = f"{taken.held_back.percent:.1f} and {beside.held_back.percent:.1f} %"
+        found.append(
+            f"Structure: {spelled(taken.options)}. The criterion of {spelled(beside.options)} is "
+            f"{taken.criterion - beside.criterion:.3g} lower, but its errors of held-back blocks are not significantly "
+            f"smaller: their fits are {fits}."
+        )
+    elif others:
+        found.append(
+            f"Structure: {spelled(taken.options)}; {_lower(taken, others[0])} than with the runner-up, "
+            f"{spelled(others[0].options)}."
+        )
+    if not isinstance(given.poles, int | tuple) and given.modes is None and best.options.order >= MOST_POLES:
+        found.append(
+            f"Structures with more than {MOST_POLES} poles were not tried (--poles 1:12 tries them); ctid frf shows "
+            "whether the record has more lightly damped modes."
+        )
+    return found + of_range(delays, given, time_unit)
 
 
 def of_range(delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
@@ -106,30 +119,11 @@ def of_range(delays: tuple[float, float], given: Given, time_unit: str) -> list[
     return [f"Delay: searched from 0 to {delays[1]:g} {time_unit} (--delay)."]
 
 
-def _too_large(ranking: Ranking) -> list[str]:
-    """Explain why the structure of least criterion was not chosen, if it predicts poorly."""
-    larger = [
-        each for each in ranking.candidates if not each.predicts and each.prediction_ratio == each.prediction_ratio
-    ]
-    if not larger:
-        return []
-    each, best = min(larger, key=lambda each: each.criterion), ranking.best
-    named = f"{each.name} (criterion {best.criterion - each.criterion:.3g} lower)"
-    return [
-        f"Not larger: in held-back blocks the squared error of {named} is {each.prediction_ratio:.2g} times that "
-        f"of its fit; that of {best.name} is {best.prediction_ratio:.2g} times."
-    ]
-
-
 def of_criterion(ranking: Ranking) -> str:
     """Describe the criterion."""
     order = ranking.noise.order
     noise = f"one autoregressive noise model of order {order}" if order else "white noise"
     return f"Criterion: BIC of the innovations with {noise} for all, each parameter counted {PENALTY:g} times."
-
-
-def _below(models: Ranking, other: Candidate, name: object) -> str:
-    return f"{_lower(models.best, other)} than with the runner-up, {name}"
 
 
 def _lower(best: Candidate, other: Candidate) -> str:

@@ -7,9 +7,9 @@ import numpy as np
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimators.identification import Validation, laid_out_validation, tests_of, validated
 from ctid_cli.estimators.measured_fit import MeasuredFit
-from ctid_cli.identification.choice import Choice, Given
-from ctid_cli.identification.criterion import Candidate, Errors, Searched, criteria_of
-from ctid_cli.identification.initial_states import states_of
+from ctid_cli.identification.choice import Candidate, Choice, Given, Searched
+from ctid_cli.identification.choose import states_of
+from ctid_cli.identification.criterion import criteria_of
 from ctid_cli.inference import criteria
 from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.progress import reported
@@ -33,7 +33,7 @@ class CandidateDiagnostics:
 
 def diagnosed(choice: Choice, given: Given, validation: Record | None) -> list[CandidateDiagnostics]:
     """Compute the diagnostics of all candidates of a choice, the best first."""
-    other = None if validation is None else with_hold(validation, choice.ranking.best.hold)
+    other = None if validation is None else with_hold(validation, choice.taken.hold)
     return [_diagnosed(each, choice, given, other) for each in choice.ranking.candidates]
 
 
@@ -41,7 +41,7 @@ def _diagnosed(candidate: Candidate, choice: Choice, given: Given, other: Record
     fit, options = candidate.fit, candidate.options
     outputs = [record.y[use] for record, use in zip(choice.fitted, fit.used, strict=True)]
     total = np.concatenate([y - y.mean() for y in outputs])
-    left = criteria.cross_validated_errors(*Errors.of(fit))
+    left = criteria.cross_validated_errors(fit.residuals, [psi @ fit.tangent for psi in fit.sensitivities])
     free = np.flatnonzero(fit.tangent.any(axis=1))
     covariance = fit.uncertainty("white").covariance[np.ix_(free, free)]
     residuals = np.concatenate(fit.residuals)
@@ -71,7 +71,7 @@ def validated_on(record: Record, options: Searched, fit: MeasuredFit, given: Giv
     """Assess a fixed model on a record, in the treatment that the criterion prefers."""
     tried = laid_out_for(record, options, given)
     applied = [own._applied(fit, laid_out) for own, laid_out in tried]
-    models = [Errors(each.residuals, [np.zeros((e.size, 0)) for e in each.residuals]) for each in applied]
+    models = [each.residuals for each in applied]
     sizes = [laid_out.layout.own for _, laid_out in tried]
     best = int(np.argmin(criteria_of(models, [each.used for each in applied], sizes)))
     return replace(validated(applied[best], record), options=tried[best][0])

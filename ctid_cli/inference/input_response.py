@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.inference.intervals import robust_deviation
-from ctid_cli.inference.signal_features import InputMoves, input_moves, outliers
+from ctid_cli.inference.signal_features import QUIET_SHARE, InputMoves, begins_quietly, input_moves, outliers
 from ctid_cli.progress import reported
 from ctid_cli.signals.record import Record
 
@@ -40,6 +40,11 @@ SIGNIFICANT, SIGNIFICANT_FRACTION = 5.0, 0.3
 POSSIBLE = 3.0
 #: Delays are searched within one period of an input whose autocorrelation exceeds this.
 PERIODIC = 0.3
+#: Greatest delay that is tried, as a share of the record; with a later response it is this multiple of its latest
+#: beginning plus this number of sampling intervals, at most this share of the time after the first change of the input.
+LATEST, LATE, FURTHER, REMAINING = 0.1, 1.5, 3, 0.9
+#: A response is seen where the output is this many deviations away from its level in a quiet beginning.
+ONSET = 5.0
 
 
 @dataclass(frozen=True)
@@ -145,6 +150,37 @@ def _detrended(x: Array) -> Array:
     flat = flat - ramp * float(ramp @ flat / (ramp @ ramp))
     # A straight line leaves rounding errors only.
     return flat if float(np.abs(flat).max()) > 1e-12 * float(np.abs(x).max()) else np.zeros(x.size)
+
+
+def greatest_delay(records: Sequence[Record]) -> float:
+    """Return the greatest delay that is tried [s]: a share of the record, or beyond the beginning of the response."""
+    interval = max(float(np.median(np.diff(record.t))) for record in records)
+    hints = [analyse_response(each).delay for record in records for each in record.each_input]
+    lates = [hint.late for hint in hints if hint is not None] + [_onset(record) for record in records]
+    late = max(LATE * late + FURTHER * interval for late in lates)
+    remaining = min(record.t[-1] - _first_change(record) for record in records)
+    return float(min(max(LATEST * min(record.duration for record in records), late), REMAINING * remaining))
+
+
+def _onset(record: Record) -> float:
+    """Return the time from the first change of an input to the first response after a quiet beginning; 0 without."""
+    if not begins_quietly(record):
+        return 0.0
+    t, y = record.t[record.valid], record.y[record.valid]
+    first = min(float(input_moves(each).changes.min(initial=np.inf)) for each in record.each_input)
+    before = y[t < first]
+    away = np.abs(y - before.mean()) > max(ONSET * float(before.std()), QUIET_SHARE * float(y.std()))
+    # Two samples in a row: one may be an outlier.
+    both = np.flatnonzero(away[:-1] & away[1:] & (t[:-1] >= first))
+    return float(t[both[0]] - first) if both.size else 0.0
+
+
+def _first_change(record: Record) -> float:
+    """Return the first instant at which an input changes within a record [s]."""
+    moving = [signal.t[1:][np.diff(signal.values) != 0.0] for signal in record.held.values()]
+    inside = [float(t[t > record.t[0]].min(initial=np.inf)) for t in moving]
+    first = min(inside)
+    return first if first < record.t[-1] else float(record.t[0])
 
 
 # --- frequency domain: the band --------------------------------------------------------------------

@@ -12,6 +12,8 @@ from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.progress import reported
 from ctid_cli.signals.record import Record
 
+#: Relative difference from a multiple of a step that counts as rounding.
+WHOLE = 1e-3
 #: An input with at most this number of changes gives single step responses and no averages over frequency.
 FEW_CHANGES = 3
 #: An input with at most this number of values changes between levels.
@@ -19,6 +21,11 @@ FEW_LEVELS = 20
 #: Spread of a measured level, and share of the samples that make one, both as a fraction of the whole.
 LEVEL_WIDTH = 0.1
 LEVEL_SHARE = 0.02
+#: Least time before the first of many changes of an input that shows rest, relative to the longest between two of them.
+LONGER = 1.2
+#: Blocks of the output before the first change of the input, and their least size. The output is constant if their
+#: means differ by less than this number of standard errors, or by less than this share of its deviation.
+QUIET_BLOCKS, QUIET_SIZE, QUIET_ERRORS, QUIET_SHARE = 5, 2, 4.5, 0.05
 
 
 @dataclass(frozen=True)
@@ -103,6 +110,31 @@ LOCAL = 20
 FEW_REPEATED = 0.02
 #: Least growth of an unstable output in part of the record that can be distinguished from a polynomial in time.
 GROWTH = 4.0
+
+
+def begins_quietly(record: Record) -> bool:
+    """Return whether a record begins at rest: with constant inputs, longer than later ones, and a constant output."""
+    moves = [input_moves(each) for each in record.each_input]
+    changes = np.concatenate([one.changes for one in moves])
+    if any(one.kind == "continuous" for one in moves) or not changes.size:
+        return False
+    times = np.sort(changes)
+    if changes.size > FEW_CHANGES and times[0] - record.t[0] < LONGER * np.diff(times).max():
+        return False
+    y = record.y[record.valid]
+    before = y[record.t[record.valid] < changes.min()]
+    size = before.size // QUIET_BLOCKS
+    if size < QUIET_SIZE:
+        return False
+    blocks = before[before.size - size * QUIET_BLOCKS :].reshape(QUIET_BLOCKS, size)
+    means, inner = blocks.mean(axis=1), blocks - blocks.mean(axis=1, keepdims=True)
+    if np.ptp(means) < QUIET_SHARE * float(y.std()):
+        return True
+    variance = float(np.sum(inner**2)) / (QUIET_BLOCKS * (size - 1))
+    # The variance of a mean of autoregressive noise of order 1 is (1 + r)/(1 - r) times that of white noise.
+    together = float(np.sum(inner[:, 1:] * inner[:, :-1])) / max(float(np.sum(inner**2)), np.finfo(float).tiny)
+    factor = (1.0 + max(together, 0.0)) / max(1.0 - together, 0.05)
+    return bool(np.ptp(means) < QUIET_ERRORS * np.sqrt(factor * variance / size))
 
 
 def outliers(y: Array) -> IntArray:
@@ -199,3 +231,13 @@ def quantum(y: Array) -> float:
     # Quantised values may be rounded again in files.
     fits = np.abs(multiples - np.round(multiples)) < 0.15
     return step if np.mean(fits) > 0.9 and step > 0.01 * y.std() else math.nan
+
+
+def resolution(y: Array) -> float:
+    """Return the step of which all differences of a signal are multiples, 0 if there is none."""
+    gaps = np.diff(np.unique(y))
+    gaps = gaps[gaps > 1e-9 * np.ptp(y)]
+    if not gaps.size:
+        return 0.0
+    multiples = gaps / gaps.min()
+    return float(gaps.min()) if np.all(np.abs(multiples - np.round(multiples)) < WHOLE * multiples) else 0.0

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
-from ctid_cli.identification.choice import Choice, Given
-from ctid_cli.identification.criterion import Candidate, Searched
+from ctid_cli.identification.choice import Candidate, Choice, Given, Searched
 from ctid_cli.identification.sentences import spelled
 from ctid_cli.identification.validation import CandidateDiagnostics, diagnosed
 from ctid_cli.reporting.document import Column, Result, Section, Table
@@ -25,14 +24,9 @@ if TYPE_CHECKING:
 
 #: Most rows of the printed table.
 ROWS = 12
-#: Mark of a structure that cannot be chosen, and its meaning.
-NO_CANDIDATE = "no"
-ABOUT_NO_CANDIDATE = (
-    "- Structures marked no are excluded: the data do not determine their parameters; or a pair of poles stopped at "
-    "the least damping or the highest frequency that is allowed, and follows this record's noise; or a smaller "
-    "structure predicts held-back blocks of the record far better."
-)
 STRUCTURE = ("poles", "zeros", "integrators")
+#: Fit of held-back blocks, and difference of their errors from those of the structure that they are compared with.
+HELD_BACK = ("held_back_percent", "held_back_difference", "held_back_error")
 #: Columns that identify a sum of second-order submodels.
 OF_A_SUM = ("modes", "integrators")
 
@@ -55,10 +49,8 @@ class OrderSearchResult(Result):
     def sections(self) -> list[Section]:
         """Return the choice, the best structures, and the other choices."""
         choice = self.choice
-        verdict = f"Chosen: {spelled(choice.ranking.best.options)}." if choice.has_model else choice.why_no_model
+        verdict = f"Chosen: {spelled(choice.taken.options)}." if choice.has_model else choice.why_no_model
         notes = [f"- {note}" for note in (*choice.sentences, *self.records.notes)]
-        if any(not each.candidate.is_admissible for each in self.candidates[:ROWS]):
-            notes.append(ABOUT_NO_CANDIDATE)
         if len(self.candidates) > ROWS:
             notes.append(f"- The best {ROWS} of {len(self.candidates)} structures; all are in order.json.")
         return [
@@ -74,7 +66,7 @@ class OrderSearchResult(Result):
     def _draw(self, figure: Figure) -> None:
         """Draw error and criterion over all poles, a line for each number of zeros; open marks with an integrator."""
         error, criterion = figure.subplots(1, 2)
-        best = self.choice.ranking.best
+        best, taken = self.choice.ranking.best, self.choice.taken
         is_sum = isinstance(best.options, AdditiveOutputError)
         by_size = sorted(self.choice.ranking.candidates, key=lambda each: each.options.order)
         lines: dict[tuple[int, int], list[Candidate]] = {}
@@ -91,7 +83,7 @@ class OrderSearchResult(Result):
             criterion.plot(poles, [each.criterion - best.criterion for each in own], label=label, **look)
         if self.choice.has_model:
             chosen = {"color": MARK, "markersize": 13, "fillstyle": "none", "label": "chosen"}
-            criterion.plot(best.options.order, 0.0, "o", **chosen)
+            criterion.plot(taken.options.order, taken.criterion - best.criterion, "o", **chosen)
         error.set_yscale("log")
         # Linear for small differences, logarithmic beyond.
         criterion.set_yscale("symlog", linthresh=10.0)
@@ -115,22 +107,24 @@ class OrderSearchResult(Result):
             *(Column(name) for name in names),
             Column("criterion_above_least", "criterion", "+.1f"),
             Column("fit_percent", "fit %", ".2f"),
+            Column("held_back_percent", "held-back fit %", ".2f"),
+            Column("held_back_difference", "difference", "+.2f"),
+            Column("held_back_error", "its error", ".2f"),
             Column("validation_percent", "validation %", ".2f"),
             Column("delay", form=".4g", unit=self.records.units.time),
         )
         rows = [self._content(each) for each in self.candidates[:most]]
-        marks = [NO_CANDIDATE * (not each.candidate.is_admissible) for each in self.candidates[:most]]
-        if marks and self.choice.has_model:
-            marks[0] = "*"
+        taken = self.choice.taken.fit if self.choice.has_model else None
+        marks = ["*" * (each.candidate.fit is taken) for each in self.candidates[:most]]
         marked = [row | {"chosen": mark} for row, mark in zip(rows, marks, strict=True)]
         return Table.of(marked, columns)
 
     def content(self) -> dict[str, Any]:
         """Return the structures for ``order.json``."""
-        choice, best = self.choice, self.choice.ranking.best
+        choice = self.choice
         return {
             **self.records.content(),
-            "recommended": _structure(best.options) if choice.has_model else None,
+            "recommended": _structure(choice.taken.options) if choice.has_model else None,
             "reason": " ".join(choice.sentences) if choice.has_model else choice.why_no_model,
             "choices": choice.sentences,
             "command": choice.words(),
@@ -152,7 +146,8 @@ class OrderSearchResult(Result):
             "criterion": each.candidate.criterion,
             "criterion_above_least": each.candidate.criterion - least.criterion,
             **picked(criteria, ("aicc", "bic", "fpe")),
-            "bic_above_least": criteria.bic - least.criteria.bic,
+            "bic_above_least": criteria.bic - least.criteria.bic if criteria and least.criteria else None,
+            **dict(zip(HELD_BACK, (each.candidate.held_back or (None,) * 4)[:3], strict=True)),
             "yic": each.yic,
             "white": all(test.white for test in each.tests) if tested else None,
             "independent": all(test.uncorrelated for test in each.tests) if tested else None,

@@ -8,10 +8,9 @@ import pytest
 
 from ctid_cli import Given, HeldSignal, Record, TransferFunction, choose, identify, simulate
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.identification import held_back
-from ctid_cli.identification.candidates import still_pays
-from ctid_cli.identification.criterion import Ranking, ranked
-from ctid_cli.identification.sentences import of_grid
+from ctid_cli.identification import criterion
+from ctid_cli.identification.choice import Ranking
+from ctid_cli.identification.criterion import independent_share, judged, ranked
 
 SECOND = TransferFunction([2.0], [1.0, 1.2, 4.0], 0.23)
 DRIVE = TransferFunction([1.5], [1.0, 0.5, 0.0], 0.4)
@@ -130,47 +129,73 @@ def test_a_step_at_the_beginning_does_not_tell_an_integrator_from_a_drift():
     assert without_drift.options.integrators == 1
 
 
-@pytest.mark.parametrize("why", ["undetermined", "undamped"])
-def test_what_is_no_candidate_comes_last_and_tells_nothing_of_the_noise(why):
+def test_a_pair_that_may_follow_the_noise_is_not_taken_and_tells_nothing_of_the_noise():
     best, other, *_ = choice_of(SECOND).ranking.candidates
-    if why == "undetermined":
-        fit = replace(best.fit, condition_number=1e15)
-    else:
-        fit = replace(best.fit, held_poles=(complex(-best.fit.box.least_damping, 1.0),))
-    ranking = ranked([replace(best, fit=replace(fit, cost=0.0)), other])
+    held = replace(best.fit, held_poles=(complex(-best.fit.box.least_damping, 1.0),), cost=0.0)
+    estimated = replace(best, options=replace(best.options, initial_state="estimate", input_before=None), fit=held)
+    assert replace(best, fit=held).is_proper
+    assert not estimated.is_proper
+    records = choice_of(SECOND).fitted
+    ranking = ranked([estimated, other], records)
     assert ranking.best.options == other.options
-    assert ranking.noise.innovation_variance == ranked([other]).noise.innovation_variance
+    assert ranking.noise.innovation_variance == ranked([other], records).noise.innovation_variance
 
 
-def test_the_grid_goes_on_while_more_poles_pay_against_white_noise():
-    ranking = choice_of(SECOND).ranking
-    assert max(each.options.order for each in ranking.candidates) == 4
-    assert not still_pays(ranking, 4)
-    best = ranking.best
-    larger = replace(best, options=replace(best.options, poles=3), fit=replace(best.fit, cost=0.5 * best.fit.cost))
-    assert still_pays(ranked([*ranking.candidates, larger]), 4)
+def errors_of(monkeypatch, sizes):
+    """Replace the mean squared errors of blocks by given ones for each number of poles."""
+    monkeypatch.setattr(criterion, "_block_errors", lambda each, records, blocks: sizes[each.options.poles])
 
 
-@pytest.mark.parametrize(("ratio", "chosen"), [(1.5, 4), (2.5, 2)])
-def test_a_structure_that_predicts_far_worse_than_a_smaller_one_is_no_candidate(monkeypatch, ratio, chosen):
-    # Blocks are predicted with this ratio of their squared error to that of the fit.
+@pytest.mark.parametrize(
+    ("two", "three", "chosen"),
+    [
+        # The smallest whose errors are not larger by a standard error than those of the least criterion.
+        (np.ones(10), np.ones(10), 2),
+        (np.full(10, 1.5), np.ones(10), 3),
+        (np.tile([0.7, 1.5], 5), np.full(10, 2.0), 2),
+        (np.full(10, 1.5), np.full(10, 1.5), 4),
+        # Quiet blocks do not decide.
+        (np.where(np.arange(10) > 0, 0.01, 9.0), np.full(10, 2.0), 2),
+    ],
+)
+def test_the_smallest_structure_that_predicts_as_well_is_taken(monkeypatch, two, three, chosen):
     record = record_of(SECOND, count=600)
-    best = choice_of(SECOND, ONE, count=600).ranking.best
-    sizes = {4: ratio, 3: 1.2, 2: 1.0}
+    best = choice_of(SECOND, ONE, count=600).taken
     grid = [
-        replace(best, options=replace(best.options, poles=poles), criterion=best.criterion + 10.0 * (k - 1))
+        replace(best, options=replace(best.options, poles=poles), size=poles, criterion=10.0 * k)
         for k, poles in enumerate((4, 2, 3))
     ]
+    errors_of(monkeypatch, {4: np.ones(10), 3: three, 2: two})
+    ranking, taken = judged(Ranking(tuple(grid), ranked([best], [record]).noise), [record])
+    assert taken.options.poles == chosen
+    assert ranking.best.options.poles == 4
+    assert [each.held_back is not None for each in ranking.candidates] == [True] * 3
 
-    def errors(options, records, near):
-        return [np.full(record.n_samples, np.sqrt(sizes[options.poles] * best.fit.cost)) for record in records]
 
-    monkeypatch.setattr(held_back, "held_back_errors", errors)
-    ranking = held_back.without_overfitted(Ranking(tuple(grid), ranked([best]).noise), [record])
-    assert ranking.best.options.poles == chosen
-    assert len(ranking.candidates) == 3
-    said = " ".join(of_grid(ranking, (0.0, 1.0), Given(), "s"))
-    assert ("the squared error of 4/" in said) == (chosen == 2)
+def test_the_decrease_of_the_criterion_is_that_of_a_model():
+    choice = choice_of(SECOND, FEW, **COLOURED)
+    noise, best = choice.ranking.noise, choice.ranking.best
+    assert noise.order
+    at_fit = sum(float(np.sum(noise.innovations(e)[noise.order :] ** 2)) for e in best.fit.residuals)
+    promised = criterion.squared_innovations(
+        best.fit.residuals, [psi @ best.fit.tangent for psi in best.fit.sensitivities], noise
+    )
+    count, parameters = criterion.innovations_count(best.fit.residuals, noise), best.size
+    squared = count * np.exp((best.criterion - 1.5 * parameters * np.log(count)) / count)
+    assert promised - 1e-9 <= squared <= at_fit + 1e-9
+
+
+@pytest.mark.parametrize(("repeated", "least", "most"), [(1.0, 0.1, 0.12), (0.0, 0.6, 1.0)])
+def test_a_residual_that_repeats_with_the_input_counts_once(repeated, least, most):
+    # Ten half periods of a square wave.
+    u = np.where(np.arange(400) // 40 % 2, -1.0, 1.0)
+    record = record_of(SECOND, u=u, count=400)
+    rng = np.random.default_rng(3)
+    half, white = rng.standard_normal(40), rng.standard_normal(400)
+    e = repeated * u * np.tile(half, 10) + (1 - repeated) * white
+    fit = choose(record, Given(2, 0, 0, (0.0, 0.0), "rest", "none")).taken.fit
+    share = independent_share(replace(fit, residuals=(e,), used=(np.ones(400, dtype=bool),)), [record])
+    assert least <= share <= most
 
 
 def test_the_hold_is_compared_where_the_input_moves_continuously():

@@ -1,17 +1,18 @@
 """Warnings of ``identify`` about planted faults, and none without faults."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
-from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
+from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.filtering.simulate import simulate
+from ctid_cli.identification.choice import Candidate, Given
+from ctid_cli.identification.criterion import block_numbers, held_back_errors
 from ctid_cli.identification.fit_warnings import MOST, fit_warnings
-from ctid_cli.identification.held_back import block_numbers, compared, held_back_errors
 from ctid_cli.identification.identify import identify
-from ctid_cli.identification.remedies import tried_remedies
 from ctid_cli.inference.fit import Status
 from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
@@ -75,57 +76,44 @@ def looped(gain=0.8, n=600):
 CLEAN = record_of()
 FEW = 40 + 61 * np.arange(15)
 FREE = 3.0 * np.exp(-0.4 * CLEAN.t) * np.cos(1.36 * CLEAN.t)
-DRIFTING = changed(CLEAN, CLEAN.y + 5.0 + 10 * NOISE * np.linspace(0, 1, 1000))
-REMEDIED = {
-    "one pole too few": (CLEAN, FIRST_ORDER, "with --poles 2 --zeros 0 the held-back fit is"),
-    "two poles too few": (
-        record_of(TransferFunction([8.0, 4.0, 20.0], np.polymul([1.0, 0.4, 2.0], [1.0, 0.8, 12.0]))),
-        KNOWN,
-        "with --poles 4 --zeros",
-    ),
-    "an integrator": (record_of(INTEGRATING, n=600), KNOWN, "with --integrators 1 the held-back fit is"),
-    "a delay that is not searched": (record_of(LATE), KNOWN, "The delay is taken as 0 s: with --delay 0:20 "),
-    "a delay outside the range": (
-        record_of(LATE),
-        SEARCHED,
-        "The delay is at the end of its range, 1 s: with --delay ",
-    ),
-    "the wrong hold": (record_of(hold="foh", read_as="zoh", interval=0.8), KNOWN, "with --hold foh the held-back"),
-    "outliers": (spoilt(CLEAN, FEW, 50 * NOISE), KNOWN, "15 output samples are outliers (t = 8, 20.2, 32.4 s, ...)"),
-    "an offset": (changed(CLEAN, CLEAN.y + 0.3), KNOWN, "with --offset estimate the held-back fit is"),
-    "a drift": (DRIFTING, KNOWN, "with --offset drift the held-back fit is"),
-    "a step of one pole too few": (step_of(20.0), FIRST_ORDER, "with --poles 2 --zeros 0 BIC of the innovations is"),
-    "one pole too few, two inputs": (two_inputs(), FIRST_ORDER, "with --poles 2 --zeros 0 the held-back fit is"),
-    "a delay of the second input": (two_inputs(2.5), SEARCHED, "with --delay u2=0:12 the held-back fit is"),
-    "one pole too few for the first input": (
+FREELY = {
+    "one pole too few": (CLEAN, FIRST_ORDER, "A free choice takes 2 poles, no zero: with --poles 2 "),
+    "an integrator": (record_of(INTEGRATING, n=600), KNOWN, "--integrators 1"),
+    "a delay outside the range": (record_of(LATE), SEARCHED, "--delay 0:"),
+    "an offset": (changed(CLEAN, CLEAN.y + 0.3), KNOWN, "--offset estimate"),
+    "one pole too few, two inputs": (
         two_inputs(),
-        replace(FIRST_ORDER, inputs=(InputModel("u1", poles=1), InputModel("u2", poles=2))),
-        "with --poles u1=2 --zeros u1=0 the held-back fit is",
+        FIRST_ORDER,
+        "A free choice takes 2 poles, no zero: with --poles 2 ",
     ),
 }
 OBSERVED = {
     "an unstable plant": (record_of(TransferFunction([1.0], [1.0, -0.04])), FIRST_ORDER, "The output diverges"),
     "feedback": (looped(), FIRST_ORDER, "The input follows earlier residuals"),
+    "outliers": (spoilt(CLEAN, FEW, 50 * NOISE), KNOWN, "15 output samples are outliers (t = 8, 20.2, 32.4 s, ...)"),
     "saturation": (changed(CLEAN, np.clip(CLEAN.y, -0.9, 0.9)), KNOWN, "exactly at the least or greatest value"),
 }
 
 
-#: Several inputs with several structures to try, and treatments that are tried after other remedies.
-LONG = (
-    "a delay of the second input",
-    "one pole too few for the first input",
-    "one pole too few, two inputs",
-    "a drift",
-    "a delay outside the range",
+@pytest.mark.parametrize(
+    "fault", [pytest.param(name, marks=[pytest.mark.slow] * (name != "one pole too few")) for name in FREELY]
 )
+def test_a_typed_structure_is_compared_with_a_free_choice(fault):
+    record, options, words = FREELY[fault]
+    found = identify([record], options)
+    (first,) = (warning for warning in found.warnings if warning.startswith("A free choice takes"))
+    assert words in first
+    better, worse = re.search(r"the held-back fit is (\S+) instead of (\S+) %", first).groups()
+    assert float(better) > float(worse)
+    assert len(found.warnings) <= MOST
 
 
-@pytest.mark.parametrize("fault", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in REMEDIED])
-def test_a_planted_fault_is_named_first_with_a_remedy_that_was_tried(fault):
-    record, options, words = REMEDIED[fault]
-    warnings = identify([record], options).warnings
-    assert words in warnings[0]
-    assert len(warnings) <= MOST
+def test_a_chosen_structure_is_not_chosen_again():
+    loud = changed(CLEAN, CLEAN.y + 20 * NOISE * np.random.default_rng(7).standard_normal(1000))
+    found = identify(loud, Given(poles=(1, 2), zeros=0, delay_bounds=(0.0, 0.0)))
+    (low,) = (warning for warning in found.warnings if warning.startswith("The fit is "))
+    assert f"{found.fit.fit_percent:.1f} %" in low
+    assert not any("A free choice" in warning for warning in found.warnings)
 
 
 @pytest.mark.parametrize("fault", OBSERVED)
@@ -150,14 +138,6 @@ def test_a_clean_record_needs_no_words(hold):
     assert identify([record_of(seed=3, hold=hold)], KNOWN).warnings == ()
 
 
-def test_a_pole_that_is_as_slow_as_the_record_names_no_remedy_that_was_not_tried():
-    record = record_of(TransferFunction([1.0], [1.0, 1e-4]), n=300)
-    found = identify([record], DelayProfile(1, 0, (0, 0), initial_state="estimate"))
-    options = {str(each.option) for each in tried_remedies([record], found.options, found.fit).remedies}
-    (slow,) = (warning for warning in found.warnings if "integrator" in warning)
-    assert "--" not in slow or any(option in slow for option in options)
-
-
 def test_an_integrator_that_a_zero_cancels_is_a_drift():
     record = record_of(TransferFunction([2.0, 0.002], [1.0, 0.8, 2.0, 0.0]))
     found = identify([record], DelayProfile(2, 1, (0, 0), integrators=1))
@@ -167,53 +147,28 @@ def test_an_integrator_that_a_zero_cancels_is_a_drift():
     assert not any("cancels" in warning for warning in without.warnings)
 
 
-def test_a_low_fit_says_what_was_tried_without_gain():
-    loud = changed(CLEAN, CLEAN.y + 10 * NOISE * np.random.default_rng(7).standard_normal(1000))
-    result = identify([loud], KNOWN)
-    (low,) = (warning for warning in result.warnings if warning.startswith("The fit is "))
-    assert f"{result.fit.fit_percent:.1f} %" in low
-    assert "tried without gain: other values of --poles, --zeros, " in low
-
-
-@pytest.mark.slow
-def test_another_remedy_is_named_in_addition_to_the_first():
-    record = changed(CLEAN, CLEAN.y + 0.6)
-    found = tried_remedies([record], FIRST_ORDER, FIRST_ORDER.fit([record])).remedies
-    assert [remedy.in_addition for remedy in found] == [False, True]
-    assert [remedy.kind for remedy in found] == ["structure", "treatment"]
-    assert found[1].before == pytest.approx(found[0].after, abs=0.01)
-    assert found[1].options == replace(found[0].options, offset="estimate")
-
-
 def test_the_held_back_fit_is_that_of_fits_that_did_not_see_the_blocks():
     record = record_of(n=440)
-    (numbers,) = block_numbers([record])
-    assert np.bincount(numbers + 1).tolist() == [40] * 11
     fit = KNOWN.fit(record)
-    (errors,) = held_back_errors(KNOWN, [record], (fit.model.denominator, 0.0))
-    held = np.isin(numbers, [1, 5])
+    blocks = block_numbers(fit.used)
+    assert np.bincount(blocks[0] + 1).tolist() == [40] * 11
+    (errors,) = held_back_errors(Candidate(KNOWN, "zoh", fit, 3), [record], blocks)
+    held = np.isin(blocks[0], [1, 5])
     other = KNOWN.fit(Record(record.t, np.where(held, np.nan, record.y), record.input))
     expected = record.y - simulate(other.model, record.input, record.t)
     np.testing.assert_allclose(errors[held], expected[held], atol=1e-5)
-    gain = compared([2.0 * errors], [errors], [record])
-    assert (100 - gain.before) / (100 - gain.after) == pytest.approx(2.0)
-    falls = [3 * np.sum(errors[numbers == block] ** 2) for block in range(10)]
-    score = np.mean(falls) / np.std(falls, ddof=1) * np.sqrt(10)
-    assert gain.score == pytest.approx(score)
-    assert gain.standard_error == pytest.approx((gain.after - gain.before) / score)
-    assert (gain.helps, gain.end) == (True, 0.25)
+
+
+def test_blocks_begin_with_the_samples_that_are_used():
+    # The first ones determine the initial state, and are never held back.
+    use = np.arange(130) >= 20
+    (numbers,) = block_numbers([use])
+    assert np.bincount(numbers + 1).tolist() == [30, *[10] * 10]
 
 
 def test_several_records_say_which_one():
     warnings = identify([CLEAN, spoilt(record_of(seed=1), [500], 2.0)], KNOWN).warnings
     assert warnings[0].startswith("1 output sample is an outlier (t = 100 s of experiment 2)")
-
-
-@pytest.mark.slow
-def test_a_long_record_is_tried_on_its_beginning():
-    record = record_of(n=12_000)
-    (remedy,) = tried_remedies([record], FIRST_ORDER, FIRST_ORDER.fit([record])).remedies
-    assert remedy.option == "--poles 2 --zeros 0"
 
 
 def test_feedback_that_is_known_is_no_warning():

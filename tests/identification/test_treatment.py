@@ -8,9 +8,9 @@ import pytest
 from ctid_cli import HeldSignal, Record, TransferFunction, identify, simulate
 from ctid_cli.estimation.common import Fixed
 from ctid_cli.identification.choice import Given
-from ctid_cli.identification.choose import choose
-from ctid_cli.identification.criterion import gains_of_treatments
-from ctid_cli.identification.initial_states import begins_quietly, greatest_delay
+from ctid_cli.identification.choose import choose, gains_of_treatments
+from ctid_cli.inference.input_response import greatest_delay
+from ctid_cli.inference.signal_features import begins_quietly
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -49,7 +49,8 @@ def test_a_drift_under_a_typed_structure_is_estimated(integrators):
 def test_a_drift_after_a_quiet_beginning_is_estimated():
     record = record_of(u=step(at=100), drift=1.5, offset=5.0)
     options = choose(record, Given(poles=1, zeros=0)).options
-    assert begins_quietly([record_of(u=step(at=100), offset=5.0)])
+    assert begins_quietly(record_of(u=step(at=100), offset=5.0))
+    assert not begins_quietly(record)
     assert options.offset == "drift"
 
 
