@@ -74,6 +74,8 @@ UNLIKELY = 1e-2
 EXCITED, LEAD = 0.5, 10
 #: Significance level at which outliers have moved an estimate.
 MOVED = 0.05
+#: A treatment is rejected if its mean squared output error is this many times the least one of those compared.
+CONTRADICTED = 4.0
 #: Options of the treatment of records.
 TREATMENT = ("initial_state", "input_before", "offset")
 
@@ -346,13 +348,14 @@ class _Choosing:
         rests = [each for each in settings if each.initial_state == "rest"]
         if len(rests) > 1:
             # All samples determine the level before the record, mainly the first ones.
-            level = self._compared(self.part, rests, structures, delays, start).best.options.input_before
+            levels = without_contradicted(self._compared(self.part, rests, structures, delays, start))
+            level = levels.best.options.input_before
             settings = [each for each in settings if each.initial_state != "rest" or each.input_before == level]
         common = self._common(settings, delays[1])
         if self.given.offset is None:
             # An output that is constant at first has no drift.
             settings = [each for each in with_offsets(settings, self.part) if not self.quiet or each.offset != "drift"]
-        ranking = self._compared(common, settings, structures, delays, start)
+        ranking = without_contradicted(self._compared(common, settings, structures, delays, start))
         kept = without_needless_drift(ranking)
         self.gains = gains_of_treatments(kept)
         best = self._treated(kept, delays[1])
@@ -556,6 +559,18 @@ def is_slow(model: AnyModel, records: Sequence[Record]) -> bool:
     """Return whether a model has a pole slower than the records, other than an integrator."""
     poles = np.abs(np.concatenate([each.poles for each in fractions_of(model)]))
     return bool(np.any(poles[poles > 0.0] * max(record.duration for record in records) < 1.0))
+
+
+def without_contradicted(ranking: Ranking) -> Ranking:
+    """Return the candidates of treatments whose output error is not far above the least one.
+
+    The whitening of slow noise removes most of the error of a wrong level, which a fit of the output then has.
+    """
+    least: dict[tuple[object, ...], float] = {}
+    for each in ranking.candidates:
+        least[_treatment_of(each)] = min(each.fit.cost, least.get(_treatment_of(each), np.inf))
+    most = CONTRADICTED * min(least.values())
+    return replace(ranking, candidates=tuple(e for e in ranking.candidates if least[_treatment_of(e)] <= most))
 
 
 def without_needless_drift(ranking: Ranking) -> Ranking:

