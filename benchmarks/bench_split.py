@@ -1,0 +1,161 @@
+"""Choice of structure on the beginning of measured records, judged on the rest.
+
+    python benchmarks/bench_split.py FILE DATA... [--grid GRID] [--share .6] [--poles 6]
+
+DATA is a file that ``ctid_cli.read_record`` reads, with optional columns and level of the input before the record:
+``arm.csv``, ``arm.csv,u2,y2``, ``step.csv,u,y,0``. The structure is chosen on the first 60 % of the samples. A model is
+judged by its fit on the rest: simulated with the input of the whole record; free responses of its poles and a constant,
+for an integrator a slope too, are estimated on the rest, as for a validation record.
+
+The reference is the best on the rest of all structures of 1 to 6 poles with all fewer zeros, with and without an
+integrator, in the chosen treatment and in six others, in the chosen range of the delay. Each choice adds a line to
+FILE (JSON), each grid one to GRID (FILE with the suffix .grid unless given); existing ones are not computed again.
+Choices of two versions with the same GRID have the same reference, with the range of the first one.
+
+Columns: fit of the chosen model on both parts, the best fit on the rest and its structure, the regret (their
+difference), and processor time of the choice.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+from _timing import cpu
+
+import numpy as np
+
+from ctid_cli import Given, HeldSignal, Record, choose, read_record, simulate
+from ctid_cli.errors import CtidError
+from ctid_cli.identification.candidates import Setting, Several, Span, Structures
+
+#: State, input before the record, and offset.
+TREATMENTS = (
+    ("rest", "first", "estimate"),
+    ("rest", None, "none"),
+    ("rest", None, "estimate"),
+    ("estimate", None, "estimate"),
+    ("rest", "first", "drift"),
+    ("estimate", None, "drift"),
+)
+
+
+def read(given):
+    """Return a record and the level of its input before it, if given."""
+    path, *rest = given.split(",")
+    columns = dict(zip(("input", "output"), rest, strict=False))
+    return read_record(path, **columns), float(rest[2]) if len(rest) > 2 else None
+
+
+def first_part(record, share):
+    """Return the first samples of a record."""
+    n = round(share * record.n_samples)
+    signal = record.input
+    kept = signal.t <= record.t[n - 1]
+    return Record(record.t[:n], record.y[:n], HeldSignal(signal.t[kept], signal.values[kept], signal.hold))
+
+
+def fits(model, record, hold, n):
+    """Return the fit on the rest of a record [%]."""
+    signal = HeldSignal(record.input.t, record.input.values - record.input.values[0], hold)
+    x, since = simulate(model, signal, record.t)[n:], record.t[n:] - record.t[n]
+    poles = model.poles[np.abs(model.poles) > 0]
+    free = np.exp(np.outer(since, poles[poles.imag >= 0]))
+    columns = [free.real, free.imag[:, poles[poles.imag >= 0].imag > 0], np.ones((since.size, 1))]
+    columns += [since[:, None]] * (poles.size < model.poles.size)
+    use = record.valid[n:]
+    y, psi = record.y[n:][use], np.hstack(columns)[use]
+    e = y - x[use]
+    e = e - psi @ np.linalg.lstsq(psi, e, rcond=None)[0]
+    return float(100 * (1 - np.linalg.norm(e) / np.linalg.norm(y - y.mean())))
+
+
+def grid(part, record, hold, treatments, delays, most):
+    """Return the structures of a grid with their fits on the rest of the record."""
+    found = []
+    for treatment in treatments:
+        for integrators in (0, 1) if treatment[2] != "drift" else (0,):
+            own = Setting(hold, *treatment), integrators, delays, Several(), Span()
+            structures = Structures.of([part], *own)
+            for poles in range(1 - integrators, most - integrators + 1):
+                for zeros in range(poles + integrators):
+                    candidate = structures.fit(poles, zeros)
+                    if candidate is not None:
+                        fit = fits(candidate.fit.model, record, hold, part.n_samples)
+                        found.append([fit, poles, zeros, integrators, *treatment])
+    return sorted(found, key=lambda row: -row[0])
+
+
+def chosen(name, given, share):
+    """Return the choice on the first part and its fit on the rest."""
+    record, before = read(given)
+    part = first_part(record, share)
+    row = {"name": name, "share": share}
+    try:
+        row["cpu"], choice = cpu(choose, part, Given(input_before=before))
+        fit = choice.options.fit(choice.records, None)
+    except CtidError as error:
+        return {**row, "message": str(error)}
+    options, hold = choice.options, choice.records[0].hold
+    row |= {name: getattr(options, name) for name in ("poles", "zeros", "integrators")}
+    row |= {"treatment": [options.initial_state, options.input_before, options.offset], "hold": hold}
+    row |= {"delays": options.delay_bounds, "delay": fit.model.delay, "command": " ".join(choice.words())}
+    y = np.concatenate([each[use] for each, use in zip([part.y], fit.used, strict=True)])
+    error = np.linalg.norm(fit.residuals[0]) / np.linalg.norm(y - y.mean())
+    return row | {"first": float(100 * (1 - error)), "fit": fits(fit.model, record, hold, part.n_samples)}
+
+
+def known_lines(path):
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def added(path, row):
+    with path.open("a") as file:
+        file.write(json.dumps(row) + "\n")
+    return row
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("data", nargs="+")
+    parser.add_argument("--grid", type=Path)
+    parser.add_argument("--share", type=float, default=0.6)
+    parser.add_argument("--poles", type=int, default=6)
+    given = parser.parse_args()
+    path = given.grid or given.file.with_suffix(".grid")
+    rows, grids = ({(row["name"], row["share"]): row for row in known_lines(each)} for each in (given.file, path))
+    print(f"{'record':36}{'chosen':>7} {'treatment':24}{'first':>7}{'rest':>7}  {'best':34}{'regret':>7}{'CPU s':>7}")
+    regrets, spent = [], []
+    for data in given.data:
+        name = ",".join([Path(data.split(",")[0]).stem, *data.split(",")[1:]])
+        key = name, given.share
+        row = rows[key] if key in rows else added(given.file, chosen(name, data, given.share))
+        if "message" in row:
+            print(f"{name:36}{row['message']}")
+            continue
+        if key not in grids:
+            record, _ = read(data)
+            treatments = dict.fromkeys([tuple(row["treatment"]), *TREATMENTS])
+            part, delays = first_part(record, given.share), tuple(row["delays"])
+            seconds, found = cpu(grid, part, record, row["hold"], treatments, delays, given.poles)
+            grids[key] = added(path, {"name": name, "share": given.share, "cpu": seconds, "found": found[:50]})
+        best, *what = grids[key]["found"][0]
+        regrets.append(best - row["fit"])
+        spent.append(row["cpu"])
+        print(
+            f"{name:36}{words(row['poles'], row['zeros'], row['integrators']):>7} {words(*row['treatment']):24}"
+            f"{row['first']:7.2f}{row['fit']:7.2f}  {f'{best:.2f} {words(*what[:3])} {words(*what[3:])}':34}"
+            f"{regrets[-1]:7.2f}{row['cpu']:7.1f}",
+            flush=True,
+        )
+    if regrets:
+        above = sum(each > 6 for each in regrets)
+        print(f"median regret {np.median(regrets):.2f}, above 6: {above} of {len(regrets)}; {sum(spent):.1f} CPU s")
+
+
+def words(*parts):
+    return "/".join("-" if each is None else str(each) for each in parts)
+
+
+if __name__ == "__main__":
+    main()
