@@ -18,6 +18,7 @@ difference), and processor time of the choice.
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 from _timing import cpu
@@ -51,7 +52,7 @@ def first_part(record, share):
     n = round(share * record.n_samples)
     signal = record.input
     kept = signal.t <= record.t[n - 1]
-    return Record(record.t[:n], record.y[:n], HeldSignal(signal.t[kept], signal.values[kept], signal.hold))
+    return Record(record.t[:n], record.y[:n], replace(signal, t=signal.t[kept], values=signal.values[kept]))
 
 
 def fits(model, record, hold, n):
