@@ -26,7 +26,7 @@ from _timing import cpu
 import numpy as np
 
 from ctid_cli import Given, HeldSignal, Record, choose, read_record, simulate
-from ctid_cli.errors import CtidError
+from ctid_cli.errors import CtidError, DataError
 from ctid_cli.identification.candidates import Setting, Several, Span, Structures
 
 #: State, input before the record, and offset.
@@ -76,7 +76,10 @@ def grid(part, record, hold, treatments, delays, most):
     for treatment in treatments:
         for integrators in (0, 1) if treatment[2] != "drift" else (0,):
             own = Setting(hold, *treatment), integrators, delays, Several(), Span()
-            structures = Structures.of([part], *own)
+            try:
+                structures = Structures.of([part], *own)
+            except DataError:  # a constant input with an unknown level before it
+                continue
             for poles in range(1 - integrators, most - integrators + 1):
                 for zeros in range(poles + integrators):
                     candidate = structures.fit(poles, zeros)
