@@ -25,9 +25,13 @@ from _timing import cpu
 
 import numpy as np
 
-from ctid_cli import Given, HeldSignal, Record, choose, read_record, simulate
+from ctid_cli import DelayProfile, Given, HeldSignal, Record, choose, read_record, simulate
 from ctid_cli.errors import CtidError, DataError
-from ctid_cli.identification.candidates import Setting, Several, Span, Structures
+from ctid_cli.estimation.optimum.best_model import best_of_orders
+from ctid_cli.estimation.optimum.box import box_of
+from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
+from ctid_cli.estimators.measured_fit import fitted
+from ctid_cli.signals.record import with_hold
 
 #: State, input before the record, and offset.
 TREATMENTS = (
@@ -73,19 +77,23 @@ def fits(model, record, hold, n):
 def grid(part, record, hold, treatments, delays, most):
     """Return the structures of a grid with their fits on the rest of the record."""
     found = []
-    for treatment in treatments:
-        for integrators in (0, 1) if treatment[2] != "drift" else (0,):
-            own = Setting(hold, *treatment), integrators, delays, Several(), Span()
+    for state, before, offset in treatments:
+        for integrators in (0, 1) if offset != "drift" else (0,):
+            own = {"integrators": integrators, "initial_state": state, "input_before": before, "offset": offset}
+            options = DelayProfile(1 - integrators, 0, delays, **own)
             try:
-                structures = Structures.of([part], *own)
+                measured = options.prepare(with_hold(part, hold)).laid_out
             except DataError:  # a constant input with an unknown level before it
                 continue
+            # One search for all structures.
+            box = box_of(measured.problem, measured.treatment.delay_bounds)
+            search = StructureSearch(measured.problem, box, effort=QUICK)
             for poles in range(1 - integrators, most - integrators + 1):
                 for zeros in range(poles + integrators):
-                    candidate = structures.fit(poles, zeros)
-                    if candidate is not None:
-                        fit = fits(candidate.fit.model, record, hold, part.n_samples)
-                        found.append([fit, poles, zeros, integrators, *treatment])
+                    laid_out = measured.with_degrees(poles + integrators, [zeros])
+                    fit = fitted(laid_out, best_of_orders(search, poles, zeros), None)
+                    on_rest = fits(fit.model, record, hold, part.n_samples)
+                    found.append([on_rest, poles, zeros, integrators, state, before, offset])
     return sorted(found, key=lambda row: -row[0])
 
 
@@ -103,7 +111,7 @@ def chosen(name, given, share):
     row |= {name: getattr(options, name) for name in ("poles", "zeros", "integrators")}
     row |= {"treatment": [options.initial_state, options.input_before, options.offset], "hold": hold}
     row |= {"delays": options.delay_bounds, "delay": fit.model.delay, "command": " ".join(choice.words())}
-    y = np.concatenate([each[use] for each, use in zip([part.y], fit.used, strict=True)])
+    y = part.y[fit.used[0]]
     error = np.linalg.norm(fit.residuals[0]) / np.linalg.norm(y - y.mean())
     return row | {"first": float(100 * (1 - error)), "fit": fits(fit.model, record, hold, part.n_samples)}
 
