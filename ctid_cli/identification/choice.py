@@ -26,9 +26,9 @@ Searched = DelayProfile | AdditiveOutputError
 OF_INPUTS = ("poles", "zeros", "integrators", "delay_bounds")
 #: Most poles, integrators included, unless more are asked for.
 MOST_POLES = 6
-#: Bounds at which a pair of poles is undamped, and radians of the record below which the free response of such a pair,
-#: which decays by less than a tenth, may be an oscillation of the noise.
-UNDAMPED, UNRESOLVED = frozenset({"least_damping", "imaginary"}), 100.0
+#: Bounds at which a pair of poles is undamped, and radians of the record between which the response of such a pair may
+#: be an oscillation of the noise: slower ones are two integrators, and faster ones would decay by more than a tenth.
+UNDAMPED, RESOLVED, UNRESOLVED = frozenset({"least_damping", "imaginary"}), 3.0, 100.0
 #: Poles (integrators included) and zeros of the structures with which settings of records are compared.
 SMALL = ((1, 0), (2, 1), (3, 2))
 
@@ -243,9 +243,8 @@ class Candidate:
         length = 1.0 / box.spread[0]
         if isinstance(fit.model, TransferFunction) and zero_on_integrator(fit.model, length) is not None:
             return False
-        followed = [pole for pole in fit.held_poles if 0.0 < abs(pole.imag) * length < UNRESOLVED]
-        estimated = self.options.initial_state == "estimate"
-        return not any(UNDAMPED & set(box.met_by(pole)) for pole in followed if estimated)
+        followed = [pole for pole in fit.held_poles if RESOLVED < abs(pole.imag) * length < UNRESOLVED]
+        return not any(UNDAMPED & set(box.met_by(pole)) for pole in followed)
 
     @property
     def structure(self) -> tuple[int, int]:

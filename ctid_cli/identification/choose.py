@@ -37,7 +37,7 @@ from ctid_cli.estimators.structure_fits import SAMPLES_PER_PARAMETER, StructureF
 from ctid_cli.identification import sentences
 from ctid_cli.identification.choice import Candidate, Choice, Given, Ranking, Searched
 from ctid_cli.identification.criterion import judged, ranked
-from ctid_cli.inference.input_response import greatest_delay
+from ctid_cli.inference.input_response import first_change, greatest_delay
 from ctid_cli.inference.noise_model import NoiseModel
 from ctid_cli.inference.repetition import range_of, repetitions_of, without_level
 from ctid_cli.inference.residual_tests import chi_square_tail
@@ -279,7 +279,8 @@ class _Choosing:
         interval = np.inf if self.several else self._interval_of(self.part)
         self.repeats = bool(np.isfinite(interval))
         shortest = min(record.duration for record in self.part)
-        latest = rounded(interval if self.repeats else greatest_delay(self.part)) if given is None else given[1]
+        step = max(float(np.median(np.diff(record.t))) for record in self.part)
+        latest = rounded(interval if self.repeats else self._latest(step)) if given is None else given[1]
         farthest = latest if self.repeats or given is not None else max(latest, rounded(HALF * shortest))
         delays = given or (0.0, latest)
         while True:
@@ -297,8 +298,14 @@ class _Choosing:
             return given
         if self.repeats:
             return (0.0, 2.0 * latest) if self._begins_later(latest, ranking) else delays
-        step = max(float(np.median(np.diff(record.t))) for record in self.part)
         return 0.0, rounded(min(max(REACH * delay + FURTHER * step, 2.0 * FURTHER * step), delays[1]))
+
+    def _latest(self, step: float) -> float:
+        """Return the greatest delay that is tried [s]; before a few steps an initial state needs some samples."""
+        latest, first = greatest_delay(self.part), min(first_change(each) - each.t[0] for each in self.part)
+        few = all(input_moves(each).kind == "steps" for record in self.part for each in record.each_input)
+        lead = float(first) - (LEAD + 1) * step
+        return latest if self.quiet or not few or lead < FURTHER * step else min(latest, lead)
 
     def _interval_of(self, records: Sequence[Record]) -> float:
         """Return the length of the range of delays that the input can tell apart [s]; infinite without repetition."""

@@ -158,7 +158,7 @@ def greatest_delay(records: Sequence[Record]) -> float:
     hints = [analyse_response(each).delay for record in records for each in record.each_input]
     lates = [hint.late for hint in hints if hint is not None] + [_onset(record) for record in records]
     late = max(LATE * late + FURTHER * interval for late in lates)
-    remaining = min(record.t[-1] - _first_change(record) for record in records)
+    remaining = min(record.t[-1] - first_change(record) for record in records)
     return float(min(max(LATEST * min(record.duration for record in records), late), REMAINING * remaining))
 
 
@@ -175,7 +175,7 @@ def _onset(record: Record) -> float:
     return float(t[both[0]] - first) if both.size else 0.0
 
 
-def _first_change(record: Record) -> float:
+def first_change(record: Record) -> float:
     """Return the first instant at which an input changes within a record [s]."""
     moving = [signal.t[1:][np.diff(signal.values) != 0.0] for signal in record.held.values()]
     inside = [float(t[t > record.t[0]].min(initial=np.inf)) for t in moving]
