@@ -392,7 +392,7 @@ class _Choosing:
             chosen = rest if at_rest and likely else estimated
             self.reasons.append(sentences.of_state(rest.best, estimated.best, likely))
         elif self.given.initial_state is None:
-            assumed = sentences.rest_assumed(models.best.options, self.quiet)
+            assumed = sentences.of_assumed(models.best.options, self.quiet)
             self.reasons.append(assumed if self.from_start else sentences.STATE_OF_PART)
         if self.given.offset is None:
             self.reasons.append(sentences.of_setting(chosen, "offset"))

@@ -48,9 +48,11 @@ def of_outliers(number: int) -> str:
     return f"Loss: tukey (--loss), as {outlying(number)}; all else is chosen without {'it' if number == 1 else 'them'}."
 
 
-def rest_assumed(options: Searched, quiet: bool) -> str:
-    """State that rest is assumed, and why."""
-    if quiet:
+def of_assumed(options: Searched, quiet: bool) -> str:
+    """State the only state before the record that was left to compare, and why."""
+    if options.initial_state == "estimate":
+        why = "the output error from rest is more than twice as large"
+    elif quiet:
         why = "the output is constant until the input changes"
     else:
         why = "this is assumed, as the input does not change enough after the longest delay to estimate a state"

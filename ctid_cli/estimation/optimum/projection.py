@@ -232,6 +232,9 @@ class Span:
             phi, y = np.hstack((both @ weights.basis, phi[:, self.shared :])), y - both @ weights.given
         # Columns are scaled to length one, so that the rank does not depend on the units of input, output and time.
         lengths = np.sqrt(np.einsum("ij,ij->j", phi, phi))
+        if not np.isfinite(lengths).all():
+            # A response that overflows explains nothing, so that the search turns away from such poles.
+            phi[:, ~np.isfinite(lengths)] = lengths[~np.isfinite(lengths)] = 0.0
         self.lengths = np.where(lengths > 0.0, lengths, 1.0)
         left, values, right = np.linalg.svd(phi / self.lengths, full_matrices=False)
         rank = int(np.count_nonzero(values > RANK_TOLERANCE * values[:1]))

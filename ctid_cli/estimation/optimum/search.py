@@ -155,6 +155,9 @@ class Descent:
             for k, delay in enumerate(point.delays)
         )
         found = slopes(self.problem, point.speed, point.damping, delays, projected, free)
+        if not np.isfinite(found.curvature).all():
+            # Responses overflow, and the search stays at a point of no use.
+            found = found._replace(gradient=np.zeros_like(found.gradient), curvature=np.zeros_like(found.curvature))
         inner = self.box.quarter * np.eye(found.gradient.size)
         n = found.gradient.size - len(free)
         inner[:n, :n] = point.jacobian()
