@@ -37,6 +37,7 @@ from ctid_cli.estimators.structure_fits import SAMPLES_PER_PARAMETER, StructureF
 from ctid_cli.identification import sentences
 from ctid_cli.identification.choice import Candidate, Choice, Given, Ranking, Searched
 from ctid_cli.identification.criterion import judged, ranked
+from ctid_cli.inference.criteria import DECISIVE
 from ctid_cli.inference.input_response import first_change, greatest_delay
 from ctid_cli.inference.noise_model import NoiseModel
 from ctid_cli.inference.repetition import range_of, repetitions_of, without_level
@@ -60,10 +61,8 @@ HALF, SHARE, WHOLE = 0.5, 0.4, 0.999
 #: The grid ends this many orders above the structure of least criterion, not before this order. Then a number of
 #: integrators is dropped if its best structure is this far behind.
 BEYOND, FEWEST_TRIED, BEHIND = 2, 4, 30.0
-#: Decrease of the criterion from which a drift is estimated, or a response begins after one interval of a repeating
-#: input: very strong evidence by Kass and Raftery (1995). Smaller differences than the second are rounding: for
-#: integrators alone a state is equivalent to an offset.
-DECISIVE, TIE = 10.0, 1e-3
+#: Smaller differences of the criterion are rounding: for integrators alone a state is equivalent to an offset.
+TIE = 1e-3
 #: Increase of the criterion up to which models with equal parameters are likely: 95 % of chi-square with one degree of
 #: freedom.
 LIKELY = 3.84

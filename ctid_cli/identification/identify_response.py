@@ -8,9 +8,8 @@ import numpy as np
 from ctid_cli.estimators.frequency_domain import MISFIT, FrequencyDomain, FrequencyDomainFit, FrequencyDomainSum
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.reported_parameters import determined, free_directions, reported_parameters
-from ctid_cli.identification.choose import DECISIVE
 from ctid_cli.identification.fit_warnings import LOW_FIT, MOST, of_conditioning, of_lost_poles, of_search
-from ctid_cli.inference.criteria import information_criteria, r_t_squared, young_information_criterion
+from ctid_cli.inference.criteria import DECISIVE, information_criteria, r_t_squared, young_information_criterion
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.response_test import LEVEL, ResponseTest
 from ctid_cli.processors import one_thread

@@ -4,7 +4,7 @@ from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.identification import Options
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.identification.choice import MOST_POLES, Candidate, Given, Ranking, Searched
-from ctid_cli.inference.criteria import PENALTY
+from ctid_cli.inference.criteria import DECISIVE, PENALTY
 from ctid_cli.text import count, listed
 
 #: Sentence if the beginning of a record is not used.
@@ -106,12 +106,28 @@ def of_grid(ranking: Ranking, taken: Candidate, delays: tuple[float, float], giv
             f"Structure: {spelled(taken.options)}; {_lower(taken, others[0])} than with the runner-up, "
             f"{spelled(others[0].options)}."
         )
+    found += _of_integrators(ranking, taken)
     if not isinstance(given.poles, int | tuple) and given.modes is None and best.options.order >= MOST_POLES:
         found.append(
             f"Structures with more than {MOST_POLES} poles were not tried (--poles 1:12 tries them); ctid frf shows "
             "whether the record has more lightly damped modes."
         )
     return found + of_range(delays, given, time_unit)
+
+
+def _of_integrators(ranking: Ranking, taken: Candidate) -> list[str]:
+    """Say that a structure with an integrator fits as well as one without, or the other way round."""
+    number, limit = taken.options.integrators, taken.criterion + DECISIVE
+    other = next((each for each in ranking.candidates if each.is_proper and each.options.integrators != number), None)
+    if other is None or other.criterion > limit or isinstance(taken.options, AdditiveOutputError):
+        return []
+    what = "A slow pole instead of the integrator" if number else "An integrator instead of a slow pole"
+    difference = abs(other.criterion - taken.criterion)
+    side = "higher" if other.criterion >= taken.criterion else "lower"
+    return [
+        f"{what} fits as well: the criterion of {spelled(other.options)} is {difference:.3g} {side} "
+        f"(--integrators {other.options.integrators})."
+    ]
 
 
 def of_range(delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
