@@ -1,0 +1,558 @@
+r"""Choice of the structure of a model of a frequency response, by one criterion and by lines that are held back.
+
+Structures of increasing order, with and without an integrator and a delay, are fitted until the best one lies two
+orders below the last. With V the sum of squared weighted errors, N the number of real equations and p that of
+parameters, the best has the least
+
+.. math:: N \ln (V / N) + 1.5\,p \ln N .
+
+A common factor of the standard errors is thereby free. Standard errors of measured responses are often estimates, or
+off by a factor; known ones would improve the estimate of that factor, from N equations, only. Correlated lines are
+whitened by one autoregressive model for all structures.
+
+The smallest structure is taken that predicts lines which are held back as well as the best one.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ctid_cli import progress
+from ctid_cli.arrays import Array, ComplexArray, IntArray
+from ctid_cli.errors import CtidError, DataError, OptionError
+from ctid_cli.estimation.delay_search import lowest_minima
+from ctid_cli.estimation.measured_lines import MeasuredLines, lines_of
+from ctid_cli.estimation.optimum.best_model import best_of_orders
+from ctid_cli.estimation.optimum.box import Point, box_of, point_of
+from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch, with_added_poles
+from ctid_cli.estimators.frequency_domain import FrequencyDomain, FrequencyDomainFit, fit_of_lines
+from ctid_cli.identification.choice import Given
+from ctid_cli.inference.covariance import LARGEST_CONDITION
+from ctid_cli.inference.criteria import innovations_count, squared_innovations
+from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
+from ctid_cli.processors import one_thread
+from ctid_cli.progress import reported
+from ctid_cli.signals.frequency_data import FrequencyData
+from ctid_cli.text import count, listed
+
+#: Penalty of a parameter over that in BIC, as for records.
+PENALTY = 1.5
+#: Most poles that are tried unasked, if their errors exceed the noise, and with peaks that need more; the grid ends this many poles above the best
+#: structure, and at this order at the least.
+MOST, MORE, GREATEST, BEYOND, FEWEST = 6, 10, 12, 2, 4
+#: Ratio of the squared errors of a fit to the noise between neighbouring lines from which it misses something.
+WHITE = 1.3
+#: Fewest real equations for each parameter.
+EQUATIONS_EACH = 3
+#: Squared errors below this share of the squared values are rounding.
+ROUNDING = 1e-20
+#: Groups of lines that are held back together, and blocks whose errors are compared; fewest lines for that.
+FOLDS, BLOCKS, FEWEST_LINES = 5, 10, 30
+#: Errors below this share of the mean squared error of the best structure do not count.
+SHARE = 0.1
+#: Standard errors by which a peak stands out of its surroundings, and by which it exceeds a model that misses it.
+CLEAR, MISSED = 8.0, 5.0
+#: Peaks of the errors, and dampings beside that of two lines, from which searches start.
+TRIED_PEAKS, DAMPINGS = 4, (0.02, 0.1)
+#: The range of the delay ends at this multiple of the greatest slope of the phase of so many neighbouring lines, whose
+#: values are this many times their standard errors.
+REACH, NEIGHBOURS, ABOVE_NOISE = 1.5, 10, 5.0
+#: Greatest decrease of the gain with frequency [decades per decade] of a response that does not fall.
+FLAT = -0.5
+#: Names of the bounds at which a pole pair follows an error of single lines.
+UNDAMPED = frozenset({"least_damping", "imaginary"})
+
+
+class Judged(NamedTuple):
+    """A structure with its fit, its criterion, and its errors at lines that are held back."""
+
+    #: Poles, zeros and integrators, as ``2/1`` or ``1/0 + 1``.
+    name: str
+    #: Poles, integrators included.
+    order: int
+    parameters: int
+    options: FrequencyDomain
+    fit: FrequencyDomainFit
+    criterion: float = float("nan")
+    #: Mean squared weighted error of held-back lines over that of the best fit [-]; NaN if it was not computed.
+    held_back: float = float("nan")
+    #: Mean over blocks of the logarithm of its ratio to that of the structure of least criterion, and standard error.
+    difference: float = float("nan")
+    standard_error: float = float("nan")
+    #: Whether it is chosen.
+    taken: bool = False
+
+    @property
+    def admissible(self) -> bool:
+        """Whether the data determine it, and no pole pair is at a bound of ``UNDAMPED``."""
+        box, held = self.fit.box, self.fit.held_poles
+        undamped = box is not None and any(UNDAMPED.intersection(box.met_by(pole)) for pole in held)
+        return self.fit.condition_number <= LARGEST_CONDITION and not undamped
+
+    @property
+    def words(self) -> str:
+        """The structure in words."""
+        return spelled(self.options)
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseChoice:
+    """A structure for a frequency response, with the structures from which it was chosen.
+
+    Parameters
+    ----------
+    data : FrequencyData
+        The frequency response.
+    options : FrequencyDomain
+        Options to fit.
+    judged : tuple of Judged
+        All structures, that of least criterion first.
+    noise_order : int
+        Order of the autoregressive model of the errors over the lines.
+    sentences : tuple of str
+        One for each choice.
+    missed : tuple of str
+        Sentences, without full stops, on peaks that the chosen structure does not describe.
+    """
+
+    data: FrequencyData = field(repr=False)
+    options: FrequencyDomain
+    judged: tuple[Judged, ...] = field(repr=False)
+    noise_order: int
+    sentences: tuple[str, ...]
+    missed: tuple[str, ...]
+
+    @property
+    def taken(self) -> Judged:
+        """The chosen structure."""
+        return next(each for each in self.judged if each.taken)
+
+    def words(self) -> list[str]:
+        """Return the choice as options of ``ctid fit``."""
+        options, (low, high) = self.options, self.options.delay_bounds
+        integrators = ["--integrators", f"{options.integrators}"] * bool(options.integrators)
+        delay = f"{low:g}:{high:g}" if low < high else f"{low:g}"
+        return ["--poles", f"{options.poles}", "--zeros", f"{options.zeros}", *integrators, "--delay", delay]
+
+
+def spelled(options: FrequencyDomain) -> str:
+    """Return a structure in words."""
+    parts = [count(options.poles, "pole"), count(options.zeros, "zero") if options.zeros else "no zero"]
+    parts += [count(options.integrators, "integrator")] * bool(options.integrators)
+    return f"{listed(parts)}, {'with' if options.delay_bounds[1] else 'without'} a delay"
+
+
+@one_thread
+@reported("choosing the structure")
+def choose_response(data: FrequencyData, given: Given | None = None) -> ResponseChoice:
+    """Choose those parts of the structure of a model of a frequency response that are not given.
+
+    Parameters
+    ----------
+    data : FrequencyData
+        The frequency response.
+    given : Given, optional
+        Given poles, zeros, integrators, range of the delay, and known or bounded parameters; by default none.
+
+    Returns
+    -------
+    ResponseChoice
+        The options to fit, the structures from which they were chosen, and a sentence for each choice.
+
+    Raises
+    ------
+    DataError
+        If the data are too few.
+    OptionError
+        If given options contradict each other, or do not apply to a frequency response.
+    """
+    given = given or Given()
+    for name in ("initial_state", "offset", "input_before", "loss", "inputs", "modes"):
+        if getattr(given, name) is not None:
+            raise OptionError(name, f"{name} is not available for the structure of a frequency response; drop it")
+    given.check()
+    return _Choosing(data, given).choice()
+
+
+class _Family:
+    """Structures with one number of integrators and one range of the delay."""
+
+    def __init__(
+        self, data: FrequencyData, options: FrequencyDomain, given: Given, noise: float, near: "_Family | None" = None
+    ) -> None:
+        #: Mean square of a weighted real part of the noise; and a family with a free delay, from which searches start.
+        self.noise, self.near = noise, near
+        self.data, self.options, self.given = data, options, given
+        measured = options.prepare(data).laid_out
+        assert isinstance(measured, MeasuredLines)
+        self.measured = measured
+        self.search = StructureSearch(measured.problem, box_of(measured.problem, options.delay_bounds), effort=QUICK)
+        self.searched = set[tuple[int, int]]()
+
+    def tried(self, order: int, poles: tuple[int, int], zeros: tuple[int, int], spare: int) -> Iterator[Judged]:
+        """Yield all structures of an order, integrators included, with at least ``spare`` more poles than zeros."""
+        own = order - self.options.integrators
+        if max(poles[0], int(not self.options.integrators)) <= own <= poles[1]:
+            for m in range(zeros[0], min(zeros[1], order - spare) + 1):
+                found = self._fit(own, m)
+                if found is not None:
+                    yield found
+
+    def _fit(self, poles: int, zeros: int) -> Judged | None:
+        """Fit a structure; None if there are too few lines, or it does not have the known parameters."""
+        options = replace(self.options, poles=poles, zeros=zeros)
+        laid_out, known = self.measured.with_degrees(options.order, [zeros]), len(self.given.fixed or ())
+        size = laid_out.layout.size - options.integrators - known
+        if EQUATIONS_EACH * size > self.measured.lines.count:
+            return None
+        if self.given.fixed or self.given.bounds:
+            options = replace(options, fixed=self.given.fixed, bounds=self.given.bounds)
+            fit = options.prepare(self.data).minimum()
+        else:
+            for n in range(int(not options.integrators), poles + 1):
+                for m in range(min(zeros, n + self.search.most_zeros) + 1):
+                    self._searched(n, m)
+            fit = fit_of_lines(laid_out, best_of_orders(self.search, poles, zeros), self.data)
+        assert isinstance(fit, FrequencyDomainFit)
+        integrators = f" + {options.integrators}" if options.integrators else ""
+        return Judged(f"{poles}/{zeros}{integrators}", options.order, size, options, fit)
+
+    def _searched(self, poles: int, zeros: int) -> None:
+        """Search a structure from nested ones, and from pairs at the peaks of their errors."""
+        if (poles, zeros) in self.searched:
+            return
+        self.searched.add((poles, zeros))
+        if self.near is not None and self.near.search.minima(poles, zeros):
+            point = self.near.search.best(poles, zeros)
+            points = [point_of(point.poles, self.search.box.middle, self.search.box)]
+            points += [self.search.best(poles, zeros - 1)] if zeros else []
+            self.search.refine(poles, zeros, points)
+            return
+        self.search.climb(poles, zeros)
+        if self.search.minima(poles, zeros)[0].squared_error > WHITE * self.noise * self.measured.lines.count:
+            self.search.refine(poles, zeros, self._at_peaks(poles, zeros))
+
+    def _at_peaks(self, poles: int, zeros: int) -> list[Point]:
+        """Return the two best starts with a pair at a peak of the errors of a structure with two poles less."""
+        m, lines = min(zeros, poles - 2 + self.search.most_zeros), self.measured.lines
+        below = self.search.minima(poles - 2, m)
+        if poles < 2 or m < 0 or (poles > 2 and not below):
+            return []
+        errors, roots, delay = lines.weights * lines.response, np.zeros(0, dtype=complex), self.search.box.middle
+        if below:
+            degrees = poles - 2 + self.options.integrators, [m]
+            near = self.measured.with_degrees(*degrees)
+            start = np.atleast_1d(np.poly(below[0].point.poles).real), below[0].point.seconds
+            errors = _complex(self.measured, near.errors(near.local(start))[0])
+            roots, delay = below[0].point.poles, below[0].point.seconds
+        w, size = lines.frequencies, np.abs(errors)
+        gaps = np.gradient(w) if w.size > 1 else w
+        points = []
+        for k in lowest_minima(-size, TRIED_PEAKS):
+            if w[k] > 0.0:
+                dampings = [float(np.clip(gaps[k] / w[k], 2.0 * self.search.box.least_damping, 0.5)), *DAMPINGS]
+                base, descent = (roots, delay), self.search.descent(zeros)
+                points += with_added_poles(descent, self.search.box, base, [float(w[k])], dampings, 1)
+        return self.search.descent(zeros).sorted(points)[:2]
+
+
+class _Choosing:
+    """The steps of a choice."""
+
+    def __init__(self, data: FrequencyData, given: Given) -> None:
+        self.data, self.given, self.lines = data, given, lines_of(data)
+        self.scale = _noise_scale(self.lines.frequencies, self.lines.weights * self.lines.response)
+        self.reach = _rounded(greatest_delay(data, self.scale))
+        self.peaks = _clear_peaks(data, self._errors(self.scale))
+        #: Order up to which structures are tried, and whether peaks raised it.
+        self.limit = max(MOST, min(2 * self.peaks.size, GREATEST))
+
+    def _errors(self, scale: float) -> Array:
+        """Return standard errors of the complex values, if that of a weighted real part is ``scale``."""
+        return np.asarray(np.sqrt(2.0) * scale / self.lines.weights)
+
+    def choice(self) -> ResponseChoice:
+        """Return the choice."""
+        judged, noise = self._ranked(self._grid())
+        judged = self._judged(judged, noise)
+        taken = next(each for each in judged if each.taken)
+        missed = tuple(self._missed_peaks(taken, judged)) if not isinstance(self.given.poles, int) else ()
+        sentences = tuple(self._sentences(taken, judged, noise))
+        return ResponseChoice(self.data, taken.options, judged, noise.order, sentences, missed)
+
+    # --- structures ------------------------------------------------------------------------------------
+
+    def _families(self) -> list[_Family]:
+        """Return the admitted numbers of integrators, with and without a delay."""
+        given, bounds, found = self.given, self.given.delay_bounds, list[_Family]()
+        tried = given.integrators is None and not isinstance(given.poles, int) and self._slope(first=True) < FLAT
+        delays = [(0.0, self.reach), (0.0, 0.0)] if bounds is None else [bounds]
+        for number in (0, 1) if tried else (given.integrators or 0,):
+            near = None
+            for each in delays:
+                options = FrequencyDomain(int(not number), 0, each, integrators=number)
+                near = _Family(self.data, options, given, self.scale**2, near)
+                found.append(near)
+        return found
+
+    def _grid(self) -> list[Judged]:
+        """Fit structures of increasing order, until the best lies inside the grid or none is left."""
+        given, families, found = self.given, self._families(), list[Judged]()
+        poles = (given.poles, given.poles) if isinstance(given.poles, int) else given.poles or (0, GREATEST)
+        zeros = (given.zeros, given.zeros) if isinstance(given.zeros, int) else given.zeros or (0, GREATEST)
+        most = poles[1] + max(family.options.integrators for family in families)
+        asked = given.poles is not None
+        order = 0
+        while order < (most if asked else self.limit):
+            order += 1
+            progress.report("order", order, most if asked else self.limit)
+            tried = list[Judged]()
+            for family in families:
+                known = family.options.delay_bounds[0] == family.options.delay_bounds[1]
+                proper = int(not known or (given.zeros is None and self._slope(first=False) < FLAT))
+                tried += family.tried(order, poles, zeros, proper)
+            found += tried
+            if not tried and found:
+                break
+            if order < FEWEST or not found:
+                continue
+            white, _ = self._ranked(found, correlated=False)
+            inside = order - white[0].order >= BEYOND
+            if inside and order - self._ranked(found)[0][0].order >= BEYOND:
+                break
+            if order == self.limit and not inside and self._more_needed(white[0]):
+                self.limit += BEYOND
+        if not found:
+            raise DataError(f"{self._head}the lines are too few for a model's parameters; give more frequencies")
+        return found
+
+    @property
+    def _head(self) -> str:
+        return f"{self.data.name}: " if self.data.name else ""
+
+    def _more_needed(self, best: Judged) -> bool:
+        """Return whether the best structure misses clear peaks, or more than the noise between neighbouring lines."""
+        if self.limit < GREATEST and self._missed(best, best).size:
+            return True
+        return self.limit < MORE and not self.data.correlated and best.fit.cost > WHITE * self.scale**2
+
+    def _slope(self, *, first: bool) -> float:
+        """Return the slope of the logarithm of the gain at the first, or the last, quarter of the lines; 0 at rest."""
+        w, gain = self.lines.frequencies, np.abs(self.data.response)
+        if first and w[0] == 0.0:
+            return 0.0
+        part = (w > 0.0) & (gain > 0.0) & ((w <= np.quantile(w, 0.25)) if first else (w >= np.quantile(w, 0.75)))
+        if np.unique(w[part]).size < 3:
+            return -1.0
+        return float(np.polyfit(np.log(w[part]), np.log(gain[part]), 1)[0])
+
+    def _ranked(
+        self, found: Iterable[Judged], *, correlated: bool | None = None
+    ) -> tuple[tuple[Judged, ...], NoiseModel]:
+        """Rank structures by their criterion, inadmissible ones last, with the noise model of the closest."""
+        each, half = list(found), self.lines.frequencies.size
+        closest = min(each, key=lambda one: (not one.admissible, one.fit.cost)).fit
+        residuals = np.split(closest.residuals[0], [half])
+        n, floor = closest.count, ROUNDING * float(self.lines.y_used @ self.lines.y_used)
+        correlated = self.data.correlated if correlated is None else correlated
+        noise = fit_noise_model(residuals, None if correlated else 0, float(np.log(n)))
+        ranked = []
+        for one in each:
+            errors, psi = (
+                np.split(part, [half]) for part in (one.fit.residuals[0], one.fit.sensitivities[0] @ one.fit.tangent)
+            )
+            squared, own = squared_innovations(errors, psi, noise), innovations_count(residuals, noise)
+            value = own * np.log(max(squared, floor) / own) + PENALTY * one.parameters * np.log(own)
+            ranked.append(one._replace(criterion=float(value)))
+        return tuple(sorted(ranked, key=lambda one: (not one.admissible, one.criterion))), noise
+
+    # --- lines that are held back ----------------------------------------------------------------------
+
+    @reported("held-back lines")
+    def _judged(self, ranked: tuple[Judged, ...], noise: NoiseModel) -> tuple[Judged, ...]:
+        """Return the structures, compared on held-back lines, with the smallest acceptable one taken."""
+        best, lines = ranked[0], self.lines.frequencies.size
+        compared: dict[tuple[int, int], Judged] = {}
+        for each in ranked:
+            if each is best or (each.admissible and each.parameters < best.parameters):
+                compared.setdefault((each.options.integrators, each.order), each)
+        if lines < FEWEST_LINES or len(compared) < 2:
+            return (best._replace(taken=True), *ranked[1:])
+        # Blocks are as wide as the lines are correlated, and spread over all frequencies.
+        width = max(1, min(noise.order + 1, lines // (2 * BLOCKS)))
+        blocks = np.arange(lines) // width % BLOCKS
+        errors = {id(each): self._held_back(each, blocks) for each in compared.values()}
+        squares = {key: np.array([np.mean(own[blocks == k]) for k in range(BLOCKS)]) for key, own in errors.items()}
+        least = max(SHARE * float(np.mean(errors[id(best)])), np.finfo(float).tiny)
+        logs = {key: np.log(np.maximum(own, least)) for key, own in squares.items()}
+        found, acceptable = dict[int, Judged](), [id(best)]
+        for each in compared.values():
+            key = id(each)
+            change = logs[key] - logs[id(best)]
+            mean, error = float(np.mean(change)), float(np.std(change, ddof=1) / np.sqrt(BLOCKS))
+            held = float(np.mean(errors[key])) / max(best.fit.cost, np.finfo(float).tiny)
+            found[key] = each._replace(held_back=held, difference=mean, standard_error=error)
+            acceptable += [key] * (mean <= error)
+        taken = min(acceptable, key=lambda key: (found[key].parameters, found[key].criterion))
+        found[taken] = found[taken]._replace(taken=True)
+        return tuple(found.get(id(each), each) for each in ranked)
+
+    def _held_back(self, each: Judged, blocks: IntArray) -> Array:
+        """Return the squared weighted errors of the lines, each from a fit without them; infinite if a fit fails."""
+        data, whole, errors = self.data, each.options.prepare(self.data).laid_out, np.full(blocks.size, np.inf)
+        assert isinstance(whole, MeasuredLines)
+        for fold in range(FOLDS):
+            held = blocks % FOLDS == fold
+            kept = None if data.standard_error is None else data.standard_error[~held]
+            part = replace(
+                data, frequencies=data.frequencies[~held], response=data.response[~held], standard_error=kept
+            )
+            try:
+                measured = each.options.prepare(part).laid_out
+                assert isinstance(measured, MeasuredLines)
+                model = measured.model(measured.local(measured.begin(each.fit.model)))
+                squared = np.abs(_complex(whole, whole.errors_of(model).residuals[0])) ** 2
+            except CtidError:
+                return np.full(blocks.size, np.inf)
+            errors[held] = 0.5 * squared[held]
+        return errors
+
+    # --- peaks -----------------------------------------------------------------------------------------
+
+    def _missed(self, model: Judged, closest: Judged) -> IntArray:
+        """Return the clear peaks that exceed a model, and at which it has no pole pair."""
+        w, fit = self.lines.frequencies, model.fit
+        # A model that is too small leaves large errors: the noise is that between neighbouring lines, if it is less.
+        errors = self._errors(min(self.scale, float(np.sqrt(closest.fit.cost))))
+        if self.data.standard_error is not None:
+            errors = np.maximum(errors, self.data.standard_error)
+        peaks = _clear_peaks(self.data, errors)
+        above = np.abs(self.data.response[peaks]) - np.abs(fit.responses_at(w)[peaks])
+        pairs, gaps = fit.model.poles[fit.model.poles.imag > 0.0], np.gradient(w)[peaks]
+        at = np.array(
+            [np.any(np.abs(pairs.imag - w[k]) <= 2.0 * gap) for k, gap in zip(peaks, gaps, strict=True)], bool
+        )
+        return np.asarray(peaks[(above > MISSED * errors[peaks]) & ~at])
+
+    def _missed_peaks(self, taken: Judged, judged: tuple[Judged, ...]) -> Iterator[str]:
+        """Yield a sentence on each peak that the chosen structure does not describe, and one that does."""
+        closest = min(judged, key=lambda each: (not each.admissible, each.fit.cost))
+        missed = self._missed(taken, closest)
+        scale = self._errors(float(np.sqrt(closest.fit.cost)))
+        if self.data.standard_error is not None:
+            scale = np.maximum(scale, self.data.standard_error)
+        larger = sorted((one for one in judged if one.order > taken.order), key=lambda one: one.order)
+        left = {one.name: set(self._missed(one, closest).tolist()) for one in larger if one.admissible}
+        time, output, input_ = self.data.units
+        for k in missed.tolist():
+            w, size = self.lines.frequencies[k], abs(self.data.response[k])
+            above = (size - abs(taken.fit.responses_at(self.lines.frequencies[[k]])[0])) / scale[k]
+            has = next((one for one in larger if one.admissible and k not in left[one.name]), None)
+            advice = "" if has is None else f"; --poles {has.options.poles} --zeros {has.options.zeros} has it"
+            where = f"A peak at {w:.3g} rad/{time} (magnitude {size:.3g} {output}/{input_}"
+            chosen = f"is not described by the chosen {count(taken.options.poles, 'pole')}"
+            yield f"{where}, {above:.2g} standard errors above the model) {chosen}{advice}"
+
+    # --- sentences -------------------------------------------------------------------------------------
+
+    def _sentences(self, taken: Judged, judged: tuple[Judged, ...], noise: NoiseModel) -> Iterator[str]:
+        """Yield a sentence for each choice."""
+        best, time = judged[0], self.data.units[0]
+        if len(judged) > 1 and taken is best:
+            same = taken.options.poles, taken.options.zeros, taken.options.integrators
+            others = (
+                one for one in judged[1:] if (one.options.poles, one.options.zeros, one.options.integrators) != same
+            )
+            other = next(others, judged[1])
+            fall = f"the criterion is {_shown(other.criterion - best.criterion)} lower than with the runner-up"
+            yield f"Structure: {taken.words}; {fall}, {other.words}."
+        elif len(judged) > 1:
+            fall = f"{_shown(taken.criterion - best.criterion)} lower"
+            error = f"{taken.difference:.2g} +- {taken.standard_error:.1g}"
+            yield (
+                f"Structure: {taken.words}, the smallest that predicts held-back lines as well as that of least "
+                f"criterion ({fall}), {best.words}: the logarithm of the ratio of their squared errors is {error}."
+            )
+        if self.given.delay_bounds is None:
+            yield self._about_delay(taken, judged, time)
+        if self.given.poles is None and self.limit > MOST:
+            peaks = f"the response has {count(self.peaks.size, 'clear peak')}"
+            raised = peaks if 2 * self.peaks.size >= self.limit else "fewer miss more than the noise between the lines"
+            yield f"Order: up to {self.limit} poles were tried instead of {MOST}, as {raised}."
+        elif self.given.poles is None and best.order >= self.limit:
+            yield f"Order: at most {MOST} poles were tried (ctid order --poles 1:12 tries more)."
+        white = f"whitened by an autoregressive model of order {noise.order}" if noise.order else "taken as independent"
+        yield (
+            f"Criterion: BIC of the weighted errors, {white}, with a free common factor of the standard errors, each "
+            f"parameter counted {PENALTY:g} times."
+        )
+
+    def _about_delay(self, taken: Judged, judged: tuple[Judged, ...], time: str) -> str:
+        """Describe the delay, and by how much its presence or absence is better."""
+        free = taken.options.delay_bounds[1] > 0.0
+        others = [one.criterion for one in judged if (one.options.delay_bounds[1] > 0.0) != free and one.admissible]
+        own = min(one.criterion for one in judged if (one.options.delay_bounds[1] > 0.0) == free)
+        fall = (
+            f"the criterion is {_shown(min(others) - own)} lower than {'without' if free else 'with'} one"
+            if others
+            else ""
+        )
+        searched = f"searched from 0 to {self.reach:g} {time} (--delay), 1.5 times the slope of the phase"
+        return f"Delay: {searched if free else 'none (--delay 0)'}{f'; {fall}' * bool(fall)}."
+
+
+def greatest_delay(data: FrequencyData, scale: float) -> float:
+    """Return a delay [s] beyond that of the response: a multiple of the greatest slope of its phase, and a margin.
+
+    The slope of the phase is that over a few neighbouring lines, and limited to half a turn between two lines.
+    """
+    lines = lines_of(data)
+    size = np.abs(lines.weights * lines.response) / (np.sqrt(2.0) * scale)
+    seen = (size > ABOVE_NOISE) & (lines.frequencies > 0.0)
+    if np.count_nonzero(seen) < 3:
+        return float(0.5 * np.pi / lines.lowest)
+    w, values, size = lines.frequencies[seen], lines.response[seen], size[seen]
+    gaps, weights = np.diff(w), 1.0 / (size[1:] ** -2.0 + size[:-1] ** -2.0)
+    turns = np.angle(values[1:] * values[:-1].conj())
+    width = min(NEIGHBOURS, gaps.size)
+    window = np.ones(width)
+    products = (np.convolve(weights * own, window, "valid") for own in (-turns * gaps, gaps**2))
+    slopes, narrowest = np.divide(*products), np.median(np.lib.stride_tricks.sliding_window_view(gaps, width), axis=1)
+    reach = REACH * max(float(slopes.max()), 0.0) + 0.5 * np.pi / w[-1]
+    return float(min(reach, np.pi / float(narrowest.min())))
+
+
+def _complex(measured: MeasuredLines, errors: Array) -> ComplexArray:
+    """Return weighted errors of real and imaginary parts as one complex number for each line."""
+    both = np.zeros(measured.lines.use.size)
+    both[measured.lines.use] = errors
+    return np.asarray(both[: both.size // 2] + 1j * both[both.size // 2 :])
+
+
+def _noise_scale(w: Array, weighted: ComplexArray) -> float:
+    """Return the deviation of a weighted real part, from the differences of lines from the line between neighbours."""
+    if w.size < 3:
+        return float(np.finfo(float).tiny)
+    share = np.divide(w[1:-1] - w[:-2], w[2:] - w[:-2], out=np.full(w.size - 2, 0.5), where=w[2:] > w[:-2])
+    left = weighted[1:-1] - share * weighted[2:] - (1.0 - share) * weighted[:-2]
+    squared = np.abs(left) ** 2 / (1.0 + share**2 + (1.0 - share) ** 2)
+    return max(float(np.sqrt(0.5 * np.median(squared) / np.log(2.0))), float(np.finfo(float).tiny))
+
+
+def _clear_peaks(data: FrequencyData, errors: Array) -> IntArray:
+    """Return the lines at the peaks of the gain that stand out of their surroundings."""
+    from scipy.signal import find_peaks
+
+    peaks, found = find_peaks(np.abs(data.response), prominence=0.0)
+    return np.asarray(peaks[found["prominences"] > CLEAR * errors[peaks]])
+
+
+def _rounded(delay: float) -> float:
+    """Return a delay rounded to the three digits of the printed options."""
+    return float(f"{delay:.3g}")
+
+
+def _shown(fall: float) -> str:
+    return f"{fall:.0f}" if fall >= 100.0 else f"{fall:.3g}"
