@@ -32,6 +32,7 @@ from ctid_cli.identification.choice import Given
 from ctid_cli.inference.covariance import LARGEST_CONDITION
 from ctid_cli.inference.criteria import innovations_count, squared_innovations
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
+from ctid_cli.inference.response_test import LEVEL, ResponseTest
 from ctid_cli.processors import one_thread
 from ctid_cli.progress import reported
 from ctid_cli.signals.frequency_data import FrequencyData
@@ -39,8 +40,8 @@ from ctid_cli.text import count, listed
 
 #: Penalty of a parameter over that in BIC, as for records.
 PENALTY = 1.5
-#: Most poles that are tried unasked, if their errors exceed the noise, and with peaks that need more; the grid ends this many poles above the best
-#: structure, and at this order at the least.
+#: Most poles that are tried unasked, if these miss more than noise, and with peaks that need more; the grid ends this
+#: many poles above the best structure, and at this order at the least.
 MOST, MORE, GREATEST, BEYOND, FEWEST = 6, 10, 12, 2, 4
 #: Ratio of the squared errors of a fit to the noise between neighbouring lines from which it misses something.
 WHITE = 1.3
@@ -128,6 +129,11 @@ class ResponseChoice:
     def taken(self) -> Judged:
         """The chosen structure."""
         return next(each for each in self.judged if each.taken)
+
+    @property
+    def answer(self) -> ResponseTest:
+        """Test of the values against noise."""
+        return answer_of_lines(self.taken.fit)
 
     def words(self) -> list[str]:
         """Return the choice as options of ``ctid fit``."""
@@ -336,7 +342,8 @@ class _Choosing:
         """Return whether the best structure misses clear peaks, or more than the noise between neighbouring lines."""
         if self.limit < GREATEST and self._missed(best, best).size:
             return True
-        return self.limit < MORE and not self.data.correlated and best.fit.cost > WHITE * self.scale**2
+        coloured = not self.data.correlated and not best.fit.white
+        return self.limit < MORE and coloured and best.fit.cost > WHITE * self.scale**2
 
     def _slope(self, *, first: bool) -> float:
         """Return the slope of the logarithm of the gain at the first, or the last, quarter of the lines; 0 at rest."""
@@ -501,6 +508,18 @@ class _Choosing:
         )
         searched = f"searched from 0 to {self.reach:g} {time} (--delay), 1.5 times the slope of the phase"
         return f"Delay: {searched if free else 'none (--delay 0)'}{f'; {fall}' * bool(fall)}."
+
+
+def answer_of_lines(fit: FrequencyDomainFit) -> ResponseTest:
+    """Test the model against no response by the F-distribution, allowing for a peak of the noise at any line."""
+    from scipy.stats import f as f_distribution
+
+    size, spare = fit.tangent.shape[1], fit.count - fit.tangent.shape[1]
+    ratio = fit.r2 / size / max((1.0 - fit.r2) / spare, 1e-300)
+    chances = 0.5 * fit.count
+    p_value = min(chances * float(f_distribution.sf(ratio, size, spare)), 1.0)
+    least = float(f_distribution.isf(min(LEVEL / chances, 1.0), size, spare)) * size / spare
+    return ResponseTest(fit.r2, least / (1.0 + least), p_value)
 
 
 def greatest_delay(data: FrequencyData, scale: float) -> float:
