@@ -10,7 +10,7 @@ A common factor of the standard errors is thereby free. Standard errors of measu
 off by a factor; known ones would improve the estimate of that factor, from N equations, only. Correlated lines are
 whitened by one autoregressive model for all structures.
 
-The smallest structure is taken that predicts lines which are held back as well as the best one.
+The smallest structure is taken that predicts lines which are held back as well as the best one, and has its peaks.
 """
 
 from collections.abc import Iterable, Iterator
@@ -32,6 +32,7 @@ from ctid_cli.identification.choice import Given
 from ctid_cli.inference.covariance import LARGEST_CONDITION
 from ctid_cli.inference.criteria import innovations_count, squared_innovations
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
+from ctid_cli.inference.residual_tests import all_white
 from ctid_cli.inference.response_test import LEVEL, ResponseTest
 from ctid_cli.processors import one_thread
 from ctid_cli.progress import reported
@@ -43,8 +44,9 @@ PENALTY = 1.5
 #: Most poles that are tried unasked, if these miss more than noise, and with peaks that need more; the grid ends this
 #: many poles above the best structure, and at this order at the least.
 MOST, MORE, GREATEST, BEYOND, FEWEST = 6, 10, 12, 2, 4
-#: Ratio of the squared errors of a fit to the noise between neighbouring lines from which it misses something.
-WHITE = 1.3
+#: Ratio of the squared errors of a fit to the noise between neighbouring lines up to which it misses no peak, and
+#: number of lines for a local variance.
+WHITE, LOCAL = 1.3, 15
 #: Fewest real equations for each parameter.
 EQUATIONS_EACH = 3
 #: Squared errors below this share of the squared values are rounding.
@@ -57,8 +59,8 @@ SHARE = 0.1
 CLEAR, MISSED = 8.0, 5.0
 #: Peaks of the errors, and dampings beside that of two lines, from which searches start.
 TRIED_PEAKS, DAMPINGS = 4, (0.02, 0.1)
-#: The range of the delay ends at this multiple of the greatest slope of the phase of so many neighbouring lines, whose
-#: values are this many times their standard errors.
+#: The range of the delay ends at this multiple of the greatest slope of the phase of so many neighbouring lines or
+#: more, whose values are this many times their standard errors.
 REACH, NEIGHBOURS, ABOVE_NOISE = 1.5, 10, 5.0
 #: Greatest decrease of the gain with frequency [decades per decade] of a response that does not fall.
 FLAT = -0.5
@@ -190,6 +192,10 @@ class _Family:
     ) -> None:
         #: Mean square of a weighted real part of the noise; and a family with a free delay, from which searches start.
         self.noise, self.near = noise, near
+        #: Family without a delay, whose minima are starts too.
+        self.undelayed: _Family | None = None
+        if near is not None:
+            near.undelayed = self
         self.data, self.options, self.given = data, options, given
         measured = options.prepare(data).laid_out
         assert isinstance(measured, MeasuredLines)
@@ -239,6 +245,10 @@ class _Family:
         self.search.climb(poles, zeros)
         if self.search.minima(poles, zeros)[0].squared_error > WHITE * self.noise * self.measured.lines.count:
             self.search.refine(poles, zeros, self._at_peaks(poles, zeros))
+        if self.undelayed is not None:
+            self.undelayed._searched(poles, zeros)
+            best = self.undelayed.search.best(poles, zeros)
+            self.search.refine(poles, zeros, [point_of(best.poles, self.search.box.each_delay[0][:1], self.search.box)])
 
     def _at_peaks(self, poles: int, zeros: int) -> list[Point]:
         """Return the two best starts with a pair at a peak of the errors of a structure with two poles less."""
@@ -339,11 +349,11 @@ class _Choosing:
         return f"{self.data.name}: " if self.data.name else ""
 
     def _more_needed(self, best: Judged) -> bool:
-        """Return whether the best structure misses clear peaks, or more than the noise between neighbouring lines."""
+        """Return whether the best structure misses clear peaks, or leaves correlated errors of uncorrelated lines."""
         if self.limit < GREATEST and self._missed(best, best).size:
             return True
-        coloured = not self.data.correlated and not best.fit.white
-        return self.limit < MORE and coloured and best.fit.cost > WHITE * self.scale**2
+        coloured = not self.data.correlated and not _white(best.fit.residuals[0], self.lines.frequencies.size)
+        return self.limit < MORE and coloured
 
     def _slope(self, *, first: bool) -> float:
         """Return the slope of the logarithm of the gain at the first, or the last, quarter of the lines; 0 at rest."""
@@ -394,14 +404,15 @@ class _Choosing:
         squares = {key: np.array([np.mean(own[blocks == k]) for k in range(BLOCKS)]) for key, own in errors.items()}
         least = max(SHARE * float(np.mean(errors[id(best)])), np.finfo(float).tiny)
         logs = {key: np.log(np.maximum(own, least)) for key, own in squares.items()}
-        found, acceptable = dict[int, Judged](), [id(best)]
+        found, acceptable, missed = dict[int, Judged](), [id(best)], set(self._missed(best, best).tolist())
         for each in compared.values():
             key = id(each)
             change = logs[key] - logs[id(best)]
             mean, error = float(np.mean(change)), float(np.std(change, ddof=1) / np.sqrt(BLOCKS))
             held = float(np.mean(errors[key])) / max(best.fit.cost, np.finfo(float).tiny)
             found[key] = each._replace(held_back=held, difference=mean, standard_error=error)
-            acceptable += [key] * (mean <= error)
+            # A narrow peak may lie in one block only, whose error is then uncertain for all structures.
+            acceptable += [key] * (mean <= error and missed.issuperset(self._missed(each, best).tolist()))
         taken = min(acceptable, key=lambda key: (found[key].parameters, found[key].criterion))
         found[taken] = found[taken]._replace(taken=True)
         return tuple(found.get(id(each), each) for each in ranked)
@@ -486,7 +497,7 @@ class _Choosing:
             yield self._about_delay(taken, judged, time)
         if self.given.poles is None and self.limit > MOST:
             peaks = f"the response has {count(self.peaks.size, 'clear peak')}"
-            raised = peaks if 2 * self.peaks.size >= self.limit else "fewer miss more than the noise between the lines"
+            raised = peaks if 2 * self.peaks.size >= self.limit else "fewer leave correlated errors of the lines"
             yield f"Order: up to {self.limit} poles were tried instead of {MOST}, as {raised}."
         elif self.given.poles is None and best.order >= self.limit:
             yield f"Order: at most {MOST} poles were tried (ctid order --poles 1:12 tries more)."
@@ -525,7 +536,8 @@ def answer_of_lines(fit: FrequencyDomainFit) -> ResponseTest:
 def greatest_delay(data: FrequencyData, scale: float) -> float:
     """Return a delay [s] beyond that of the response: a multiple of the greatest slope of its phase, and a margin.
 
-    The slope of the phase is that over a few neighbouring lines, and limited to half a turn between two lines.
+    The slopes are those of regressions over neighbouring lines, without two standard errors. The delay is limited to
+    half a turn between two lines.
     """
     lines = lines_of(data)
     size = np.abs(lines.weights * lines.response) / (np.sqrt(2.0) * scale)
@@ -533,14 +545,20 @@ def greatest_delay(data: FrequencyData, scale: float) -> float:
     if np.count_nonzero(seen) < 3:
         return float(0.5 * np.pi / lines.lowest)
     w, values, size = lines.frequencies[seen], lines.response[seen], size[seen]
-    gaps, weights = np.diff(w), 1.0 / (size[1:] ** -2.0 + size[:-1] ** -2.0)
-    turns = np.angle(values[1:] * values[:-1].conj())
-    width = min(NEIGHBOURS, gaps.size)
-    window = np.ones(width)
-    products = (np.convolve(weights * own, window, "valid") for own in (-turns * gaps, gaps**2))
-    slopes, narrowest = np.divide(*products), np.median(np.lib.stride_tricks.sliding_window_view(gaps, width), axis=1)
-    reach = REACH * max(float(slopes.max()), 0.0) + 0.5 * np.pi / w[-1]
-    return float(min(reach, np.pi / float(narrowest.min())))
+    phase = np.concatenate(([0.0], np.cumsum(np.angle(values[1:] * values[:-1].conj()))))
+    greatest, narrowest, width = 0.0, float(np.diff(w).max()), min(NEIGHBOURS, w.size)
+    while width <= w.size:
+        for k in range(0, w.size - width + 1, max(width // 2, 1)):
+            own = slice(k, k + width)
+            weight = size[own] / size[own].max()
+            centred = w[own] - np.average(w[own], weights=weight**2)
+            spread = float(np.sum((weight * centred) ** 2))
+            if spread > 0.0:
+                slope = -float(np.sum(weight**2 * centred * phase[own])) / spread
+                greatest = max(greatest, slope - 2.0 / (np.sqrt(2.0 * spread) * float(size[own].max())))
+                narrowest = min(narrowest, float(np.median(np.diff(w[own]))))
+        width *= 2
+    return float(min(REACH * greatest + 0.5 * np.pi / w[-1], np.pi / narrowest if narrowest > 0.0 else np.inf))
 
 
 def _complex(measured: MeasuredLines, errors: Array) -> ComplexArray:
@@ -552,12 +570,21 @@ def _complex(measured: MeasuredLines, errors: Array) -> ComplexArray:
 
 def _noise_scale(w: Array, weighted: ComplexArray) -> float:
     """Return the deviation of a weighted real part, from the differences of lines from the line between neighbours."""
+    least = float(np.sqrt(ROUNDING * np.mean(np.abs(weighted) ** 2)))
     if w.size < 3:
-        return float(np.finfo(float).tiny)
+        return least
     share = np.divide(w[1:-1] - w[:-2], w[2:] - w[:-2], out=np.full(w.size - 2, 0.5), where=w[2:] > w[:-2])
     left = weighted[1:-1] - share * weighted[2:] - (1.0 - share) * weighted[:-2]
-    squared = np.abs(left) ** 2 / (1.0 + share**2 + (1.0 - share) ** 2)
-    return max(float(np.sqrt(0.5 * np.median(squared) / np.log(2.0))), float(np.finfo(float).tiny))
+    squared = 0.5 * np.abs(left) ** 2 / (1.0 + share**2 + (1.0 - share) ** 2)
+    return max(float(np.sqrt(np.median(squared) / np.log(2.0))), least)
+
+
+def _white(errors: Array, lines: int) -> bool:
+    """Return whether errors pass as uncorrelated over the lines, with a variance that may change over them."""
+    parts = np.split(errors, [lines])
+    window = np.ones(min(LOCAL, lines))
+    powers = (np.convolve(part**2, window, "same") / np.convolve(np.ones(part.size), window, "same") for part in parts)
+    return all_white([part / np.sqrt(power + np.finfo(float).tiny) for part, power in zip(parts, powers, strict=True)])
 
 
 def _clear_peaks(data: FrequencyData, errors: Array) -> IntArray:

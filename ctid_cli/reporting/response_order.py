@@ -27,8 +27,8 @@ ABOUT_EXCLUDED = (
 )
 ABOUT_HELD_BACK = (
     "- held back: mean squared error of lines that are held back, over that of the best fit; difference: mean "
-    "logarithm of its ratio to that of the structure of least criterion over blocks of lines, with its standard error. The "
-    "smallest structure with a difference of at most its standard error is chosen."
+    "logarithm of its ratio to that of the structure of least criterion over blocks of lines, with its standard error. "
+    "The smallest structure with a difference of at most its standard error is chosen."
 )
 STRUCTURE = ("poles", "zeros", "integrators")
 
