@@ -64,6 +64,8 @@ TRIED_PEAKS, DAMPINGS = 4, (0.02, 0.1)
 REACH, NEIGHBOURS, ABOVE_NOISE = 1.5, 10, 5.0
 #: Greatest decrease of the gain with frequency [decades per decade] of a response that does not fall.
 FLAT = -0.5
+#: Decrease of the negative log-likelihood from which errors grow with the gain.
+GROWS = 10.0
 #: Names of the bounds at which a pole pair follows an error of single lines.
 UNDAMPED = frozenset({"least_damping", "imaginary"})
 
@@ -117,7 +119,7 @@ class ResponseChoice:
     sentences : tuple of str
         One for each choice.
     missed : tuple of str
-        Sentences, without full stops, on peaks that the chosen structure does not describe.
+        Sentences, without full stops, on peaks that the chosen structure does not describe, and on better weights.
     """
 
     data: FrequencyData = field(repr=False)
@@ -294,7 +296,7 @@ class _Choosing:
         judged, noise = self._ranked(self._grid())
         judged = self._judged(judged, noise)
         taken = next(each for each in judged if each.taken)
-        missed = tuple(self._missed_peaks(taken, judged)) if not isinstance(self.given.poles, int) else ()
+        missed = (*self._missed_peaks(taken, judged), *_about_weights(taken.fit))
         sentences = tuple(self._sentences(taken, judged, noise))
         return ResponseChoice(self.data, taken.options, judged, noise.order, sentences, missed)
 
@@ -531,6 +533,23 @@ def answer_of_lines(fit: FrequencyDomainFit) -> ResponseTest:
     p_value = min(chances * float(f_distribution.sf(ratio, size, spare)), 1.0)
     least = float(f_distribution.isf(min(LEVEL / chances, 1.0), size, spare)) * size / spare
     return ResponseTest(fit.r2, least / (1.0 + least), p_value)
+
+
+def _about_weights(fit: FrequencyDomainFit) -> Iterator[str]:
+    """Yield that the errors of equally weighted lines grow with the gain, if they do so clearly."""
+    data, gain = fit.data, np.abs(fit.responses_at(fit.data.frequencies))
+    if data.standard_error is not None or data.weight != "none" or not gain.all():
+        return
+    squared, size = np.abs(data.response - fit.responses_at(data.frequencies)) ** 2, float(np.sum(np.log(gain)))
+    values = {
+        weight: gain.size * float(np.log(np.mean(squared / gain**power))) + power * size
+        for weight, power in (("none", 0.0), ("inverse-sqrt", 1.0), ("inverse", 2.0))
+    }
+    weight = min(values, key=lambda name: values[name])
+    if values[weight] < values["none"] - GROWS:
+        fall = _shown(2.0 * (values["none"] - values[weight]))
+        what = f"with --weight {weight} the deviance of the errors is {fall} lower"
+        yield f"The errors grow with the gain, and all lines have the same weight: {what}"
 
 
 def greatest_delay(data: FrequencyData, scale: float) -> float:
