@@ -44,7 +44,6 @@ from .identification.choice import Choice as Choice, Given as Given
 from .identification.choose import choose as choose
 from .identification.criterion import Candidate as Candidate
 from .identification.identify import identify as identify
-from .identification.choose_response import ResponseChoice as ResponseChoice, choose_response as choose_response
 from .identification.identify_response import identify_frequency_response as identify_frequency_response
 
 # Results

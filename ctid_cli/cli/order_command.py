@@ -72,7 +72,8 @@ def order(
 
     result: OrderSearchResult | ResponseOrder
     if frequency_files(files):
-        result = frequency_order(files, grid, columns, validate)
+        given_to_it = [*given_options(grid), *["--validate"] * (validate is not None)]
+        result = frequency_order(files, grid.requested, grid.weight, columns, given_to_it)
     else:
         refuse_options(given_options(grid), RECORD, "a record in time")
         given = grid.requested()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ from ctid_cli.cli.fit_structure import FRACTION, SUM, ModelRequest, as_usage_err
 from ctid_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from ctid_cli.cli.order_command import GridOptions
+    from ctid_cli.identification.choice import Given
     from ctid_cli.reporting.frequency_fit import FrequencyFitResult
     from ctid_cli.reporting.response_order import ResponseOrder
     from ctid_cli.signals.frequency_data import FrequencyData
@@ -71,7 +71,7 @@ def frequency_fit(
     options = request.options.with_delays()
     poles, zeros, integrators = (options.common(name) for name in ("poles", "zeros", "integrators"))
     if request.is_sum and options.terms is None:
-        raise UsageError("--terms is missing: for a sum of submodels and a frequency response it must be given")
+        raise UsageError("--terms is missing: for a frequency response it must be given")
     if needing := [
         name for name, own in {"--fix": options.fix, "--bound": options.bound}.items() if own and poles is None
     ]:
@@ -91,17 +91,20 @@ def frequency_fit(
 
 
 def frequency_order(
-    files: Sequence[Path], grid: GridOptions, columns: RecordOptions, validate: object
+    files: Sequence[Path],
+    requested: Callable[[], Given],
+    weight: Weight | None,
+    columns: RecordOptions,
+    given: list[str],
 ) -> ResponseOrder:
     """Choose a structure for the given frequency response; a UsageError for options that do not apply to one."""
     from ctid_cli.identification.choose_response import choose_response
     from ctid_cli.reporting.response_order import ResponseOrder
 
     refused = OF_RECORDS | {"--model": "give the submodels to ctid fit --terms; drop it", "--modes": "drop it"}
-    given = [*given_options(grid, columns), *["--validate"] * (validate is not None)]
-    refuse_options(given, refused, _kind(files))
+    refuse_options([*given, *given_options(columns)], refused, _kind(files))
     with as_usage_errors():
-        return ResponseOrder(choose_response(_read(files, grid.weight, columns), grid.requested()))
+        return ResponseOrder(choose_response(_read(files, weight, columns), requested()))
 
 
 def _kind(files: Sequence[Path]) -> str:

@@ -59,8 +59,8 @@ SHARE = 0.1
 CLEAR, MISSED = 8.0, 5.0
 #: Peaks of the errors, and dampings beside that of two lines, from which searches start.
 TRIED_PEAKS, DAMPINGS = 4, (0.02, 0.1)
-#: The range of the delay ends at this multiple of the greatest slope of the phase of so many neighbouring lines or
-#: more, whose values are this many times their standard errors.
+#: The range of the delay ends at this multiple of the greatest slope of the phase of at least this number of
+#: neighbouring lines, whose values are at least this multiple of their standard errors.
 REACH, NEIGHBOURS, ABOVE_NOISE = 1.5, 10, 5.0
 #: Greatest decrease of the gain with frequency [decades per decade] of a response that does not fall.
 FLAT = -0.5

@@ -11,13 +11,12 @@ from ctid_cli import (
     HeldSignal,
     Record,
     TransferFunction,
-    choose_response,
     estimate_frequency_response,
     identify_frequency_response,
     simulate,
 )
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.identification.choose_response import greatest_delay
+from ctid_cli.identification.choose_response import choose_response, greatest_delay
 
 TWO = TransferFunction([2.0], [1.0, 0.6, 1.0])
 #: Two resonances, with the antiresonance between them.
@@ -66,6 +65,7 @@ def test_an_integrator_is_found():
     assert structure(choose_response(lines(model, level=0.003)).options) == (1, 0, 1, False)
 
 
+@pytest.mark.slow
 def test_peaks_raise_the_limit_to_eight_poles():
     parts = [(1.0, 0.02), (2.0, 0.015), (4.0, 0.01), (7.0, 0.008)]
     w = np.linspace(0.3, 10.0, 200)
