@@ -15,118 +15,64 @@ The smallest structure is taken that predicts lines which are held back as well 
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from ctid_cli import progress
-from ctid_cli.arrays import Array, ComplexArray, IntArray
+from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import CtidError, DataError, OptionError
-from ctid_cli.estimation.delay_search import lowest_minima
 from ctid_cli.estimation.measured_lines import MeasuredLines, lines_of
-from ctid_cli.estimation.optimum.best_model import best_of_orders
-from ctid_cli.estimation.optimum.box import Point, box_of, point_of
-from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch, with_added_poles
-from ctid_cli.estimators.frequency_domain import FrequencyDomain, FrequencyDomainFit, fit_of_lines
+from ctid_cli.estimators.frequency_domain import FrequencyDomain, FrequencyDomainFit
 from ctid_cli.identification.choice import Given
-from ctid_cli.inference.covariance import LARGEST_CONDITION
+from ctid_cli.identification.response_structures import (
+    ROUNDING,
+    Family,
+    Judged,
+    clear_peaks,
+    complex_errors,
+    greatest_delay,
+    noise_scale,
+    white_over_lines,
+)
 from ctid_cli.inference.criteria import innovations_count, squared_innovations
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
-from ctid_cli.inference.residual_tests import all_white
 from ctid_cli.inference.response_test import LEVEL, ResponseTest
 from ctid_cli.processors import one_thread
 from ctid_cli.progress import reported
 from ctid_cli.signals.frequency_data import FrequencyData
-from ctid_cli.text import count, listed
+from ctid_cli.text import count
 
 #: Penalty of a parameter over that in BIC, as for records.
 PENALTY = 1.5
 #: Most poles that are tried unasked, if these miss more than noise, and with peaks that need more; the grid ends this
 #: many poles above the best structure, and at this order at the least.
 MOST, MORE, GREATEST, BEYOND, FEWEST = 6, 10, 12, 2, 4
-#: Ratio of the squared errors of a fit to the noise between neighbouring lines up to which it misses no peak, and
-#: number of lines for a local variance.
-WHITE, LOCAL = 1.3, 15
-#: Fewest real equations for each parameter.
-EQUATIONS_EACH = 3
-#: Squared errors below this share of the squared values are rounding.
-ROUNDING = 1e-20
 #: Groups of lines that are held back together, and blocks whose errors are compared; fewest lines for that.
 FOLDS, BLOCKS, FEWEST_LINES = 5, 10, 30
 #: Errors below this share of the mean squared error of the best structure do not count.
 SHARE = 0.1
-#: Standard errors by which a peak stands out of its surroundings, and by which it exceeds a model that misses it.
-CLEAR, MISSED = 8.0, 5.0
-#: Peaks of the errors, and dampings beside that of two lines, from which searches start.
-TRIED_PEAKS, DAMPINGS = 4, (0.02, 0.1)
-#: The range of the delay ends at this multiple of the greatest slope of the phase of at least this number of
-#: neighbouring lines, whose values are at least this multiple of their standard errors.
-REACH, NEIGHBOURS, ABOVE_NOISE = 1.5, 10, 5.0
+#: Standard errors by which a peak exceeds a model that misses it.
+MISSED = 5.0
 #: Greatest decrease of the gain with frequency [decades per decade] of a response that does not fall.
 FLAT = -0.5
 #: Decrease of the negative log-likelihood from which errors grow with the gain.
 GROWS = 10.0
-#: Names of the bounds at which a pole pair follows an error of single lines.
-UNDAMPED = frozenset({"least_damping", "imaginary"})
-
-
-class Judged(NamedTuple):
-    """A structure with its fit, its criterion, and its errors at lines that are held back."""
-
-    #: Poles, zeros and integrators, as ``2/1`` or ``1/0 + 1``.
-    name: str
-    #: Poles, integrators included.
-    order: int
-    parameters: int
-    options: FrequencyDomain
-    fit: FrequencyDomainFit
-    criterion: float = float("nan")
-    #: Mean squared weighted error of held-back lines over that of the best fit [-]; NaN if it was not computed.
-    held_back: float = float("nan")
-    #: Mean over blocks of the logarithm of its ratio to that of the structure of least criterion, and standard error.
-    difference: float = float("nan")
-    standard_error: float = float("nan")
-    #: Whether it is chosen.
-    taken: bool = False
-
-    @property
-    def admissible(self) -> bool:
-        """Whether the data determine it, and no pole pair is at a bound of ``UNDAMPED``."""
-        box, held = self.fit.box, self.fit.held_poles
-        undamped = box is not None and any(UNDAMPED.intersection(box.met_by(pole)) for pole in held)
-        return self.fit.condition_number <= LARGEST_CONDITION and not undamped
-
-    @property
-    def words(self) -> str:
-        """The structure in words."""
-        return spelled(self.options)
 
 
 @dataclass(frozen=True, eq=False)
 class ResponseChoice:
-    """A structure for a frequency response, with the structures from which it was chosen.
-
-    Parameters
-    ----------
-    data : FrequencyData
-        The frequency response.
-    options : FrequencyDomain
-        Options to fit.
-    judged : tuple of Judged
-        All structures, that of least criterion first.
-    noise_order : int
-        Order of the autoregressive model of the errors over the lines.
-    sentences : tuple of str
-        One for each choice.
-    missed : tuple of str
-        Sentences, without full stops, on peaks that the chosen structure does not describe, and on better weights.
-    """
+    """A structure for a frequency response, with the structures from which it was chosen."""
 
     data: FrequencyData = field(repr=False)
+    #: Options to fit.
     options: FrequencyDomain
+    #: All structures, that of least criterion first.
     judged: tuple[Judged, ...] = field(repr=False)
+    #: Order of the autoregressive model of the errors over the lines.
     noise_order: int
+    #: One sentence for each choice.
     sentences: tuple[str, ...]
+    #: Sentences, without full stops, on peaks that the chosen structure does not describe, and on better weights.
     missed: tuple[str, ...]
 
     @property
@@ -147,36 +93,13 @@ class ResponseChoice:
         return ["--poles", f"{options.poles}", "--zeros", f"{options.zeros}", *integrators, "--delay", delay]
 
 
-def spelled(options: FrequencyDomain) -> str:
-    """Return a structure in words."""
-    parts = [count(options.poles, "pole"), count(options.zeros, "zero") if options.zeros else "no zero"]
-    parts += [count(options.integrators, "integrator")] * bool(options.integrators)
-    return f"{listed(parts)}, {'with' if options.delay_bounds[1] else 'without'} a delay"
-
-
 @one_thread
 @reported("choosing the structure")
 def choose_response(data: FrequencyData, given: Given | None = None) -> ResponseChoice:
     """Choose those parts of the structure of a model of a frequency response that are not given.
 
-    Parameters
-    ----------
-    data : FrequencyData
-        The frequency response.
-    given : Given, optional
-        Given poles, zeros, integrators, range of the delay, and known or bounded parameters; by default none.
-
-    Returns
-    -------
-    ResponseChoice
-        The options to fit, the structures from which they were chosen, and a sentence for each choice.
-
-    Raises
-    ------
-    DataError
-        If the data are too few.
-    OptionError
-        If given options contradict each other, or do not apply to a frequency response.
+    Given are poles, zeros, integrators, the range of the delay, and known or bounded parameters. A DataError states
+    that there are too few lines, an OptionError that given options contradict each other or are those of records.
     """
     given = given or Given()
     for name in ("initial_state", "offset", "input_before", "loss", "inputs", "modes"):
@@ -186,106 +109,17 @@ def choose_response(data: FrequencyData, given: Given | None = None) -> Response
     return _Choosing(data, given).choice()
 
 
-class _Family:
-    """Structures with one number of integrators and one range of the delay."""
-
-    def __init__(
-        self, data: FrequencyData, options: FrequencyDomain, given: Given, noise: float, near: "_Family | None" = None
-    ) -> None:
-        #: Mean square of a weighted real part of the noise; and a family with a free delay, from which searches start.
-        self.noise, self.near = noise, near
-        #: Family without a delay, whose minima are starts too.
-        self.undelayed: _Family | None = None
-        if near is not None:
-            near.undelayed = self
-        self.data, self.options, self.given = data, options, given
-        measured = options.prepare(data).laid_out
-        assert isinstance(measured, MeasuredLines)
-        self.measured = measured
-        self.search = StructureSearch(measured.problem, box_of(measured.problem, options.delay_bounds), effort=QUICK)
-        self.searched = set[tuple[int, int]]()
-
-    def tried(self, order: int, poles: tuple[int, int], zeros: tuple[int, int], spare: int) -> Iterator[Judged]:
-        """Yield all structures of an order, integrators included, with at least ``spare`` more poles than zeros."""
-        own = order - self.options.integrators
-        if max(poles[0], int(not self.options.integrators)) <= own <= poles[1]:
-            for m in range(zeros[0], min(zeros[1], order - spare) + 1):
-                found = self._fit(own, m)
-                if found is not None:
-                    yield found
-
-    def _fit(self, poles: int, zeros: int) -> Judged | None:
-        """Fit a structure; None if there are too few lines, or it does not have the known parameters."""
-        options = replace(self.options, poles=poles, zeros=zeros)
-        laid_out, known = self.measured.with_degrees(options.order, [zeros]), len(self.given.fixed or ())
-        size = laid_out.layout.size - options.integrators - known
-        if EQUATIONS_EACH * size > self.measured.lines.count:
-            return None
-        if self.given.fixed or self.given.bounds:
-            options = replace(options, fixed=self.given.fixed, bounds=self.given.bounds)
-            fit = options.prepare(self.data).minimum()
-        else:
-            for n in range(int(not options.integrators), poles + 1):
-                for m in range(min(zeros, n + self.search.most_zeros) + 1):
-                    self._searched(n, m)
-            fit = fit_of_lines(laid_out, best_of_orders(self.search, poles, zeros), self.data)
-        assert isinstance(fit, FrequencyDomainFit)
-        integrators = f" + {options.integrators}" if options.integrators else ""
-        return Judged(f"{poles}/{zeros}{integrators}", options.order, size, options, fit)
-
-    def _searched(self, poles: int, zeros: int) -> None:
-        """Search a structure from nested ones, and from pairs at the peaks of their errors."""
-        if (poles, zeros) in self.searched:
-            return
-        self.searched.add((poles, zeros))
-        if self.near is not None and self.near.search.minima(poles, zeros):
-            point = self.near.search.best(poles, zeros)
-            points = [point_of(point.poles, self.search.box.middle, self.search.box)]
-            points += [self.search.best(poles, zeros - 1)] if zeros else []
-            self.search.refine(poles, zeros, points)
-            return
-        self.search.climb(poles, zeros)
-        if self.search.minima(poles, zeros)[0].squared_error > WHITE * self.noise * self.measured.lines.count:
-            self.search.refine(poles, zeros, self._at_peaks(poles, zeros))
-        if self.undelayed is not None:
-            self.undelayed._searched(poles, zeros)
-            best = self.undelayed.search.best(poles, zeros)
-            self.search.refine(poles, zeros, [point_of(best.poles, self.search.box.each_delay[0][:1], self.search.box)])
-
-    def _at_peaks(self, poles: int, zeros: int) -> list[Point]:
-        """Return the two best starts with a pair at a peak of the errors of a structure with two poles less."""
-        m, lines = min(zeros, poles - 2 + self.search.most_zeros), self.measured.lines
-        below = self.search.minima(poles - 2, m)
-        if poles < 2 or m < 0 or (poles > 2 and not below):
-            return []
-        errors, roots, delay = lines.weights * lines.response, np.zeros(0, dtype=complex), self.search.box.middle
-        if below:
-            degrees = poles - 2 + self.options.integrators, [m]
-            near = self.measured.with_degrees(*degrees)
-            start = np.atleast_1d(np.poly(below[0].point.poles).real), below[0].point.seconds
-            errors = _complex(self.measured, near.errors(near.local(start))[0])
-            roots, delay = below[0].point.poles, below[0].point.seconds
-        w, size = lines.frequencies, np.abs(errors)
-        gaps = np.gradient(w) if w.size > 1 else w
-        points = []
-        for k in lowest_minima(-size, TRIED_PEAKS):
-            if w[k] > 0.0:
-                dampings = [float(np.clip(gaps[k] / w[k], 2.0 * self.search.box.least_damping, 0.5)), *DAMPINGS]
-                base, descent = (roots, delay), self.search.descent(zeros)
-                points += with_added_poles(descent, self.search.box, base, [float(w[k])], dampings, 1)
-        return self.search.descent(zeros).sorted(points)[:2]
-
-
 class _Choosing:
     """The steps of a choice."""
 
     def __init__(self, data: FrequencyData, given: Given) -> None:
         self.data, self.given, self.lines = data, given, lines_of(data)
-        self.scale = _noise_scale(self.lines.frequencies, self.lines.weights * self.lines.response)
+        self.scale = noise_scale(self.lines.frequencies, self.lines.weights * self.lines.response)
         self.reach = _rounded(greatest_delay(data, self.scale))
-        self.peaks = _clear_peaks(data, self._errors(self.scale))
-        #: Order up to which structures are tried, and whether peaks raised it.
+        self.peaks = clear_peaks(data, self._errors(self.scale))
+        #: Order up to which structures are tried, and why it was raised.
         self.limit = max(MOST, min(2 * self.peaks.size, GREATEST))
+        self.why = f"the response has {count(self.peaks.size, 'clear peak')}"
 
     def _errors(self, scale: float) -> Array:
         """Return standard errors of the complex values, if that of a weighted real part is ``scale``."""
@@ -302,16 +136,16 @@ class _Choosing:
 
     # --- structures ------------------------------------------------------------------------------------
 
-    def _families(self) -> list[_Family]:
+    def _families(self) -> list[Family]:
         """Return the admitted numbers of integrators, with and without a delay."""
-        given, bounds, found = self.given, self.given.delay_bounds, list[_Family]()
+        given, bounds, found = self.given, self.given.delay_bounds, list[Family]()
         tried = given.integrators is None and not isinstance(given.poles, int) and self._slope(first=True) < FLAT
         delays = [(0.0, self.reach), (0.0, 0.0)] if bounds is None else [bounds]
         for number in (0, 1) if tried else (given.integrators or 0,):
             near = None
             for each in delays:
                 options = FrequencyDomain(int(not number), 0, each, integrators=number)
-                near = _Family(self.data, options, given, self.scale**2, near)
+                near = Family(self.data, options, given, self.scale**2, near)
                 found.append(near)
         return found
 
@@ -340,9 +174,11 @@ class _Choosing:
             inside = order - white[0].order >= BEYOND
             if inside and order - self._ranked(found)[0][0].order >= BEYOND:
                 break
-            if order == self.limit and not inside and self._more_needed(white[0]):
-                self.limit += BEYOND
+            if order == self.limit and not inside and (why := self._why_more(white[0])):
+                self.limit, self.why = self.limit + BEYOND, why
         if not found:
+            for refusal in filter(None, (family.refusal for family in families)):
+                raise refusal
             raise DataError(f"{self._head}the lines are too few for a model's parameters; give more frequencies")
         return found
 
@@ -350,12 +186,12 @@ class _Choosing:
     def _head(self) -> str:
         return f"{self.data.name}: " if self.data.name else ""
 
-    def _more_needed(self, best: Judged) -> bool:
-        """Return whether the best structure misses clear peaks, or leaves correlated errors of uncorrelated lines."""
+    def _why_more(self, best: Judged) -> str:
+        """Return why larger structures than the best are needed: missed peaks, or correlated errors; empty if not."""
         if self.limit < GREATEST and self._missed(best, best).size:
-            return True
-        coloured = not self.data.correlated and not _white(best.fit.residuals[0], self.lines.frequencies.size)
-        return self.limit < MORE and coloured
+            return f"{count(best.order, 'pole')} miss a clear peak"
+        coloured = not self.data.correlated and not white_over_lines(best.fit.residuals[0], self.lines.frequencies.size)
+        return f"{count(best.order, 'pole')} leave correlated errors" if self.limit < MORE and coloured else ""
 
     def _slope(self, *, first: bool) -> float:
         """Return the slope of the logarithm of the gain at the first, or the last, quarter of the lines; 0 at rest."""
@@ -403,12 +239,16 @@ class _Choosing:
         width = max(1, min(noise.order + 1, lines // (2 * BLOCKS)))
         blocks = np.arange(lines) // width % BLOCKS
         errors = {id(each): self._held_back(each, blocks) for each in compared.values()}
+        if not np.isfinite(errors[id(best)]).all():
+            return (best._replace(taken=True), *ranked[1:])
         squares = {key: np.array([np.mean(own[blocks == k]) for k in range(BLOCKS)]) for key, own in errors.items()}
         least = max(SHARE * float(np.mean(errors[id(best)])), np.finfo(float).tiny)
         logs = {key: np.log(np.maximum(own, least)) for key, own in squares.items()}
         found, acceptable, missed = dict[int, Judged](), [id(best)], set(self._missed(best, best).tolist())
         for each in compared.values():
             key = id(each)
+            if not np.isfinite(errors[key]).all():
+                continue
             change = logs[key] - logs[id(best)]
             mean, error = float(np.mean(change)), float(np.std(change, ddof=1) / np.sqrt(BLOCKS))
             held = float(np.mean(errors[key])) / max(best.fit.cost, np.finfo(float).tiny)
@@ -433,7 +273,7 @@ class _Choosing:
                 measured = each.options.prepare(part).laid_out
                 assert isinstance(measured, MeasuredLines)
                 model = measured.model(measured.local(measured.begin(each.fit.model)))
-                squared = np.abs(_complex(whole, whole.errors_of(model).residuals[0])) ** 2
+                squared = np.abs(complex_errors(whole, whole.errors_of(model).residuals[0])) ** 2
             except CtidError:
                 return np.full(blocks.size, np.inf)
             errors[held] = 0.5 * squared[held]
@@ -448,7 +288,9 @@ class _Choosing:
         errors = self._errors(min(self.scale, float(np.sqrt(closest.fit.cost))))
         if self.data.standard_error is not None:
             errors = np.maximum(errors, self.data.standard_error)
-        peaks = _clear_peaks(self.data, errors)
+        peaks = clear_peaks(self.data, errors)
+        if not peaks.size:
+            return peaks
         above = np.abs(self.data.response[peaks]) - np.abs(fit.responses_at(w)[peaks])
         pairs, gaps = fit.model.poles[fit.model.poles.imag > 0.0], np.gradient(w)[peaks]
         at = np.array(
@@ -469,6 +311,8 @@ class _Choosing:
         for k in missed.tolist():
             w, size = self.lines.frequencies[k], abs(self.data.response[k])
             above = (size - abs(taken.fit.responses_at(self.lines.frequencies[[k]])[0])) / scale[k]
+            if above < MISSED:
+                continue
             has = next((one for one in larger if one.admissible and k not in left[one.name]), None)
             advice = "" if has is None else f"; --poles {has.options.poles} --zeros {has.options.zeros} has it"
             where = f"A peak at {w:.3g} rad/{time} (magnitude {size:.3g} {output}/{input_}"
@@ -498,9 +342,7 @@ class _Choosing:
         if self.given.delay_bounds is None:
             yield self._about_delay(taken, judged, time)
         if self.given.poles is None and self.limit > MOST:
-            peaks = f"the response has {count(self.peaks.size, 'clear peak')}"
-            raised = peaks if 2 * self.peaks.size >= self.limit else "fewer leave correlated errors of the lines"
-            yield f"Order: up to {self.limit} poles were tried instead of {MOST}, as {raised}."
+            yield f"Order: up to {self.limit} poles were tried instead of {MOST}, as {self.why}."
         elif self.given.poles is None and best.order >= self.limit:
             yield f"Order: at most {MOST} poles were tried (ctid order --poles 1:12 tries more)."
         white = f"whitened by an autoregressive model of order {noise.order}" if noise.order else "taken as independent"
@@ -514,11 +356,10 @@ class _Choosing:
         free = taken.options.delay_bounds[1] > 0.0
         others = [one.criterion for one in judged if (one.options.delay_bounds[1] > 0.0) != free and one.admissible]
         own = min(one.criterion for one in judged if (one.options.delay_bounds[1] > 0.0) == free)
-        fall = (
-            f"the criterion is {_shown(min(others) - own)} lower than {'without' if free else 'with'} one"
-            if others
-            else ""
-        )
+        fall = ""
+        if others:
+            change, other = min(others) - own, "without" if free else "with"
+            fall = f"the criterion is {_shown(abs(change))} {'lower' if change >= 0.0 else 'higher'} than {other} one"
         searched = f"searched from 0 to {self.reach:g} {time} (--delay), 1.5 times the slope of the phase"
         return f"Delay: {searched if free else 'none (--delay 0)'}{f'; {fall}' * bool(fall)}."
 
@@ -550,68 +391,6 @@ def _about_weights(fit: FrequencyDomainFit) -> Iterator[str]:
         fall = _shown(2.0 * (values["none"] - values[weight]))
         what = f"with --weight {weight} the deviance of the errors is {fall} lower"
         yield f"The errors grow with the gain, and all lines have the same weight: {what}"
-
-
-def greatest_delay(data: FrequencyData, scale: float) -> float:
-    """Return a delay [s] beyond that of the response: a multiple of the greatest slope of its phase, and a margin.
-
-    The slopes are those of regressions over neighbouring lines, without two standard errors. The delay is limited to
-    half a turn between two lines.
-    """
-    lines = lines_of(data)
-    size = np.abs(lines.weights * lines.response) / (np.sqrt(2.0) * scale)
-    seen = (size > ABOVE_NOISE) & (lines.frequencies > 0.0)
-    if np.count_nonzero(seen) < 3:
-        return float(0.5 * np.pi / lines.lowest)
-    w, values, size = lines.frequencies[seen], lines.response[seen], size[seen]
-    phase = np.concatenate(([0.0], np.cumsum(np.angle(values[1:] * values[:-1].conj()))))
-    greatest, narrowest, width = 0.0, float(np.diff(w).max()), min(NEIGHBOURS, w.size)
-    while width <= w.size:
-        for k in range(0, w.size - width + 1, max(width // 2, 1)):
-            own = slice(k, k + width)
-            weight = size[own] / size[own].max()
-            centred = w[own] - np.average(w[own], weights=weight**2)
-            spread = float(np.sum((weight * centred) ** 2))
-            if spread > 0.0:
-                slope = -float(np.sum(weight**2 * centred * phase[own])) / spread
-                greatest = max(greatest, slope - 2.0 / (np.sqrt(2.0 * spread) * float(size[own].max())))
-                narrowest = min(narrowest, float(np.median(np.diff(w[own]))))
-        width *= 2
-    return float(min(REACH * greatest + 0.5 * np.pi / w[-1], np.pi / narrowest if narrowest > 0.0 else np.inf))
-
-
-def _complex(measured: MeasuredLines, errors: Array) -> ComplexArray:
-    """Return weighted errors of real and imaginary parts as one complex number for each line."""
-    both = np.zeros(measured.lines.use.size)
-    both[measured.lines.use] = errors
-    return np.asarray(both[: both.size // 2] + 1j * both[both.size // 2 :])
-
-
-def _noise_scale(w: Array, weighted: ComplexArray) -> float:
-    """Return the deviation of a weighted real part, from the differences of lines from the line between neighbours."""
-    least = float(np.sqrt(ROUNDING * np.mean(np.abs(weighted) ** 2)))
-    if w.size < 3:
-        return least
-    share = np.divide(w[1:-1] - w[:-2], w[2:] - w[:-2], out=np.full(w.size - 2, 0.5), where=w[2:] > w[:-2])
-    left = weighted[1:-1] - share * weighted[2:] - (1.0 - share) * weighted[:-2]
-    squared = 0.5 * np.abs(left) ** 2 / (1.0 + share**2 + (1.0 - share) ** 2)
-    return max(float(np.sqrt(np.median(squared) / np.log(2.0))), least)
-
-
-def _white(errors: Array, lines: int) -> bool:
-    """Return whether errors pass as uncorrelated over the lines, with a variance that may change over them."""
-    parts = np.split(errors, [lines])
-    window = np.ones(min(LOCAL, lines))
-    powers = (np.convolve(part**2, window, "same") / np.convolve(np.ones(part.size), window, "same") for part in parts)
-    return all_white([part / np.sqrt(power + np.finfo(float).tiny) for part, power in zip(parts, powers, strict=True)])
-
-
-def _clear_peaks(data: FrequencyData, errors: Array) -> IntArray:
-    """Return the lines at the peaks of the gain that stand out of their surroundings."""
-    from scipy.signal import find_peaks
-
-    peaks, found = find_peaks(np.abs(data.response), prominence=0.0)
-    return np.asarray(peaks[found["prominences"] > CLEAR * errors[peaks]])
 
 
 def _rounded(delay: float) -> float:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ctid_cli.identification.choose_response import Judged, ResponseChoice, spelled
+from ctid_cli.identification.choose_response import ResponseChoice
+from ctid_cli.identification.response_structures import Judged, spelled
 from ctid_cli.reporting.document import Column, Result, Section, Table
 from ctid_cli.reporting.figures.style import LOOKS, MARK, Drawing, name_axes, plain
 from ctid_cli.reporting.layout import picked

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ctid_cli import (
+    Fixed,
     FrequencyData,
     Given,
     HeldSignal,
@@ -16,7 +17,8 @@ from ctid_cli import (
     simulate,
 )
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.identification.choose_response import choose_response, greatest_delay
+from ctid_cli.identification.choose_response import choose_response
+from ctid_cli.identification.response_structures import greatest_delay
 
 TWO = TransferFunction([2.0], [1.0, 0.6, 1.0])
 #: Two resonances, with the antiresonance between them.
@@ -90,6 +92,14 @@ def test_given_options_are_kept():
     assert (options.poles, options.zeros, options.delay_bounds) == (2, 0, (0.5, 1.0))
     options = choose_response(data, Given(poles=(1, 3), zeros=1, integrators=0, delay_bounds=(0.7, 0.7))).options
     assert (options.zeros, options.integrators, options.delay_bounds) == (1, 0, (0.7, 0.7))
+
+
+def test_a_known_coefficient_is_kept_and_an_impossible_one_refused():
+    data = lines(TWO, 60)
+    options = choose_response(data, replace(KNOWN, poles=2, fixed=(Fixed("a2", 1.0),))).options
+    assert (options.zeros, options.fixed) == (0, (Fixed("a2", 1.0),))
+    with pytest.raises(OptionError, match="a7"):
+        choose_response(data, replace(KNOWN, poles=2, fixed=(Fixed("a7", 1.0),)))
 
 
 def test_options_of_records_and_too_few_lines_are_refused():
