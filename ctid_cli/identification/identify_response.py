@@ -70,7 +70,7 @@ def _identified(
 ) -> Identification:
     """Fit a model and assess it; ``choice``: how its structure was chosen."""
     prepared = options.prepare(data)
-    minimum = prepared.minimum()
+    minimum = prepared.minimum() if choice is None else choice.taken.fit
     law = minimum.uncertainty("auto")
     fit, found = determined(minimum._with_law(law), prepared.laid_out, options._inside(minimum, prepared.laid_out))
     assert isinstance(fit, FrequencyDomainFit)

@@ -84,7 +84,10 @@ class ResponseOrder(Result):
             Column("difference_standard_error", "std. error", ".3f"),
             Column("delay", form=".4g", unit=self.choice.data.units[0]),
         )
-        return Table.of([self._content(each) | {"chosen": self._mark(each)} for each in rows], columns)
+        # A dash for structures without a delay.
+        delays = [each.fit.model.delay if each.options.delay_bounds[1] else None for each in rows]
+        marks = [{"chosen": self._mark(each), "delay": tau} for each, tau in zip(rows, delays, strict=True)]
+        return Table.of([self._content(each) | own for each, own in zip(rows, marks, strict=True)], columns)
 
     def _mark(self, each: Judged) -> str:
         if each.taken and not self._no_model:

@@ -113,7 +113,7 @@ def test_the_chosen_model_is_that_of_its_options():
     data = lines(TWO, 60)
     chosen = identify_frequency_response(data)
     typed = identify_frequency_response(data, chosen.options)
-    assert np.array_equal(chosen.fit.theta, typed.fit.theta)
+    assert chosen.fit.theta == pytest.approx(typed.fit.theta, rel=1e-6)
     assert chosen.choices
     assert not typed.choices
     assert all(text.endswith(".") for text in chosen.choices)
