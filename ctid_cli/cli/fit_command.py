@@ -119,7 +119,8 @@ def fit(
 
     Prints the parameters with their standard errors and diagnostics, and writes fit.json and fit.svg. Poles, zeros,
     integrators, the range of the delay, the hold of the input, and the treatment of state and offset are chosen by one
-    criterion unless they are given. A table of a frequency response, such as ctid frf writes, needs --poles.
+    criterion unless they are given. The file may be a table of a frequency response, such as ctid frf writes: its
+    poles, zeros, integrators and delay are chosen unless --poles is given.
     """
     request = ModelRequest(model, loop, columns.names)
     read = [*files, *([assessment.validate] if assessment.validate else [])]

@@ -11,14 +11,17 @@ from ctid_cli.canonical import plain
 from ctid_cli.cli._common import emit, guarded, span, write_files
 from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag, given_options, refuse_options
 from ctid_cli.cli.fit_structure import MODES, OPTIONS, FormOption, HoldOption, StructureOptions, as_usage_errors
-from ctid_cli.cli.response_fit import frequency_files
+from ctid_cli.cli.response_fit import frequency_files, frequency_order
 from ctid_cli.errors import UsageError
+from ctid_cli.signals.treatment import Weight
 
 if TYPE_CHECKING:
     from ctid_cli.identification.choice import Given
+    from ctid_cli.reporting.response_order import ResponseOrder
 
 #: Options of the other form of the model, and what to do.
 FRACTION = {"--modes": "add --model additive, or drop it"}
+RECORD = {"--weight": "samples have equal weights; drop it"}
 SUM = dict.fromkeys(("--poles", "--zeros"), "give the numbers of submodels by --modes, or drop it")
 
 
@@ -31,6 +34,7 @@ class GridOptions(StructureOptions):
     model: FormOption = "fraction"
     modes: Annotated[str | None, flag("--modes", "Numbers of second-order submodels of a sum.", "LOW:HIGH")] = None
     hold: HoldOption = "auto"
+    weight: Annotated[Weight | None, flag("--weight", "Weights of a response without standard errors.")] = None
 
     def requested(self) -> Given:
         """Return the given options of the choice; a UsageError names contradicting options."""
@@ -61,20 +65,22 @@ def order(
 
     Fits structures with increasing numbers of poles until the best lies inside the grid, ranks them by the criterion of
     ctid fit, and marks the chosen one; or states that there is no model. With --model additive structures are sums of
-    second-order submodels. Writes order.json and order.svg.
+    second-order submodels. The file may be a table of a frequency response. Writes order.json and order.svg.
     """
     from ctid_cli.identification.choose import choose
     from ctid_cli.reporting.order_result import OrderSearchResult
 
+    result: OrderSearchResult | ResponseOrder
     if frequency_files(files):
-        raise UsageError(
-            f"{files[0]} is a frequency response: its structure is given, not chosen; use ctid fit --poles"
-        )
-    given = grid.requested()
-    records = columns.read_all(files, validate, "zoh")
-    with as_usage_errors():
-        choice = choose(records.data, given, records.units.time)
-        result = OrderSearchResult.of(choice, given, records)
+        given_to_it = [*given_options(grid), *["--validate"] * (validate is not None)]
+        result = frequency_order(files, grid.requested, grid.weight, columns, given_to_it)
+    else:
+        refuse_options(given_options(grid), RECORD, "a record in time")
+        given = grid.requested()
+        records = columns.read_all(files, validate, "zoh")
+        with as_usage_errors():
+            choice = choose(records.data, given, records.units.time)
+            result = OrderSearchResult.of(choice, given, records)
     written = [out / "order.json", out / "order.svg"]
     content = json.dumps(plain({**result.json_content(), "written": list(map(str, written))}), allow_nan=False)
     write_files({written[0]: content.encode() + b"\n"})

@@ -13,6 +13,7 @@ from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Prepared, Start, places_of
 from ctid_cli.estimation.measured_lines import MeasuredLines
 from ctid_cli.estimation.measured_records import MeasuredRecords
+from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.parameter_layout import Degrees, SumDegrees
 from ctid_cli.estimators.additive_output_error import GROWN, AdditiveOutputError
@@ -256,8 +257,9 @@ class FrequencyDomain(_OfLines, DelayProfile):
 
     def _minimum(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
         own = _lines(measured)
-        found = self._within_bounds(own) if self.bounds else fitted(own, own.best(), None)
-        return FrequencyDomainFit(**_values(found), data=own.source)
+        if not self.bounds:
+            return fit_of_lines(own, own.best(), own.source)
+        return FrequencyDomainFit(**_values(self._within_bounds(own)), data=own.source)
 
 
 @dataclass(frozen=True)
@@ -308,6 +310,11 @@ class FrequencyDomainSum(_OfLines, AdditiveOutputError):  # noqa: N818 - not an 
         size = sum(term.size for term in self.terms)
         additive = AdditiveModel.from_theta(found.theta[:size], self.terms, found.model.delay)
         return FrequencyDomainSumFit(**_values(found), data=own.source, additive=additive, start_method=GROWN)
+
+
+def fit_of_lines(measured: MeasuredRecords, found: Optimum, data: FrequencyData) -> FrequencyDomainFit:
+    """Return an optimum for a frequency response, without standard errors."""
+    return FrequencyDomainFit(**_values(fitted(measured, found, None)), data=data)
 
 
 def _lines(measured: MeasuredRecords) -> MeasuredLines:

@@ -58,7 +58,7 @@ class FrequencyLines:
         """Weighted real and imaginary parts, shape (count,)."""
         return np.asarray(self.parts(self.response[:, None])[0])
 
-    @property
+    @cached_property
     def lowest(self) -> float:
         """Least frequency that is not zero [rad/s]."""
         return float(self.frequencies[self.frequencies > 0.0][0])
@@ -68,7 +68,7 @@ class FrequencyLines:
         """Greatest frequency [rad/s]."""
         return float(self.frequencies[-1])
 
-    @property
+    @cached_property
     def length(self) -> float:
         """Length of a record with the same frequency resolution [s]."""
         gaps = np.diff(np.unique(self.frequencies))

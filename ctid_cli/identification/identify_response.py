@@ -8,25 +8,33 @@ import numpy as np
 from ctid_cli.estimators.frequency_domain import MISFIT, FrequencyDomain, FrequencyDomainFit, FrequencyDomainSum
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.reported_parameters import determined, free_directions, reported_parameters
+from ctid_cli.identification.choice import Given
+from ctid_cli.identification.choose_response import ResponseChoice, answer_of_lines, choose_response
 from ctid_cli.identification.fit_warnings import LOW_FIT, MOST, of_conditioning, of_lost_poles, of_search
 from ctid_cli.inference.criteria import DECISIVE, information_criteria, r_t_squared, young_information_criterion
 from ctid_cli.inference.fit import Status
-from ctid_cli.inference.response_test import LEVEL, ResponseTest
+from ctid_cli.inference.response_test import ResponseTest
 from ctid_cli.processors import one_thread
 from ctid_cli.signals.frequency_data import FrequencyData
 from ctid_cli.text import probability
 
+#: Least decrease of the criterion from which a delay is missing, very strong evidence by Kass and Raftery (1995).
+DECISIVE = 10.0
+
 
 @one_thread
-def identify_frequency_response(data: FrequencyData, options: FrequencyDomain | FrequencyDomainSum) -> Identification:
-    """Fit a model to a frequency response and assess it.
+def identify_frequency_response(
+    data: FrequencyData, options: FrequencyDomain | FrequencyDomainSum | Given | None = None
+) -> Identification:
+    """Fit a model to a frequency response and assess it; its structure is chosen unless it is given.
 
     Parameters
     ----------
     data : FrequencyData
         The frequency response.
-    options : FrequencyDomain or FrequencyDomainSum
-        Structure of the model.
+    options : FrequencyDomain, FrequencyDomainSum or Given, optional
+        Structure of the model, or given parts of it; by default all are chosen, see
+        :func:`~ctid_cli.identification.choose_response.choose_response`.
 
     Returns
     -------
@@ -37,6 +45,8 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain | 
     ------
     DataError
         If the data cannot be used.
+    OptionError
+        If given options contradict each other, or do not apply to a frequency response.
 
     Examples
     --------
@@ -49,13 +59,23 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain | 
     >>> {item.name: round(item.estimate, 2) for item in found.estimates if item.status == "free"}
     {'b0': 2.01, 'a1': 1.01}
     """
+    if options is None or isinstance(options, Given):
+        choice = choose_response(data, options)
+        return _identified(data, choice.options, choice)
+    return _identified(data, options, None)
+
+
+def _identified(
+    data: FrequencyData, options: FrequencyDomain | FrequencyDomainSum, choice: ResponseChoice | None
+) -> Identification:
+    """Fit a model and assess it; ``choice``: how its structure was chosen."""
     prepared = options.prepare(data)
-    minimum = prepared.minimum()
+    minimum = prepared.minimum() if choice is None else choice.taken.fit
     law = minimum.uncertainty("auto")
     fit, found = determined(minimum._with_law(law), prepared.laid_out, options._inside(minimum, prepared.laid_out))
     assert isinstance(fit, FrequencyDomainFit)
     (residuals,), (values,) = fit.residuals, prepared.laid_out.outputs
-    response, free = _response_test(fit), free_directions(fit)[0]
+    response, free = answer_of_lines(fit), free_directions(fit)[0]
     return Identification(
         options=options,
         fit=fit,
@@ -65,20 +85,19 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain | 
         criteria=information_criteria(float(residuals @ residuals), fit.count, fit.theta.size - len(fit.known)),
         yic=young_information_criterion(residuals, values, fit.theta[free], law.covariance[np.ix_(free, free)]),
         r_t_squared=r_t_squared(residuals, values),
-        warnings=tuple(f"{text}." for text in [*_of_delay(fit, options), *_warnings(fit, response)][:MOST]),
+        warnings=tuple(f"{text}." for text in [*_of_structure(fit, options, choice), *_warnings(fit, response)][:MOST]),
+        choices=() if choice is None else choice.sentences,
     )
 
 
-def _response_test(fit: FrequencyDomainFit) -> ResponseTest:
-    """Test the model against no response by the F-distribution, allowing for a peak of the noise at any line."""
-    from scipy.stats import f as f_distribution
-
-    size, spare = fit.tangent.shape[1], fit.count - fit.tangent.shape[1]
-    ratio = fit.r2 / size / max((1.0 - fit.r2) / spare, 1e-300)
-    chances = 0.5 * fit.count
-    p_value = min(chances * float(f_distribution.sf(ratio, size, spare)), 1.0)
-    least = float(f_distribution.isf(min(LEVEL / chances, 1.0), size, spare)) * size / spare
-    return ResponseTest(fit.r2, least / (1.0 + least), p_value)
+def _of_structure(
+    fit: FrequencyDomainFit, options: FrequencyDomain | FrequencyDomainSum, choice: ResponseChoice | None
+) -> Iterator[str]:
+    """Yield peaks that the chosen structure does not describe, and that a delay is missing if none was chosen."""
+    if choice is None:
+        yield from _of_delay(fit, options)
+    elif choice.answer.seen:
+        yield from choice.missed
 
 
 def _of_delay(fit: FrequencyDomainFit, options: FrequencyDomain | FrequencyDomainSum) -> Iterator[str]:

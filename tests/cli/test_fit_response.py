@@ -53,3 +53,19 @@ def test_a_delay_that_is_missing_is_named(ctid, tmp_path):
     response_file(tmp_path)
     found = ctid("fit --poles 1 --json --out", tmp_path / "new", tmp_path / "frf.csv").stdout
     assert json.loads(found)["warnings"][0].startswith("The delay is taken as 0 s: with --delay 0:16 the fit is 9")
+
+
+def test_the_structure_is_chosen_and_its_candidates_are_shown(ctid, tmp_path):
+    file = response_file(tmp_path)
+    found = json.loads(ctid("fit --json --out", tmp_path / "new", file).stdout)
+    assert found["choices"][0].startswith("Structure: 1 pole and no zero, with a delay; the criterion is ")
+    assert found["parameters"][-1]["estimate"] == pytest.approx(0.5, abs=0.02)
+    shown = ctid("order --out", tmp_path / "order", file).stdout
+    assert "Chosen: 1 pole and no zero, with a delay." in shown
+    content = json.loads((tmp_path / "order" / "order.json").read_text())
+    assert content["recommended"] == {"poles": 1, "zeros": 0, "integrators": 0}
+    assert [each["taken"] for each in content["orders"]].count(True) == 1
+    assert (tmp_path / "order" / "order.svg").read_bytes().startswith(b"<?xml")
+    again = json.loads(ctid(" ".join(["fit", *content["command"], "--json --out"]), tmp_path / "again", file).stdout)
+    estimates = ([each["estimate"] for each in one["parameters"]] for one in (found, again))
+    assert next(estimates) == pytest.approx(next(estimates), rel=1e-6)
