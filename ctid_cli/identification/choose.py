@@ -36,7 +36,7 @@ from ctid_cli.estimators.measured_fit import MultiInputFit
 from ctid_cli.estimators.structure_fits import SAMPLES_PER_PARAMETER, StructureFits
 from ctid_cli.identification import sentences
 from ctid_cli.identification.choice import Candidate, Choice, Given, Ranking, Searched
-from ctid_cli.identification.criterion import judged, ranked
+from ctid_cli.identification.criterion import few_changes, judged, own_criterion, ranked
 from ctid_cli.inference.criteria import DECISIVE
 from ctid_cli.inference.input_response import first_change, greatest_delay
 from ctid_cli.inference.noise_model import NoiseModel
@@ -71,6 +71,8 @@ UNLIKELY = 1e-2
 #: Share of its range that the input must cross after the greatest delay, so that an estimated state leaves the gain
 #: determined, and least number of samples from then on to the first of a few changes.
 EXCITED, LEAD = 0.5, 10
+#: Share of its deviation by which the output moves before a few changes if the record does not begin at rest.
+MOVING = 0.2
 #: Significance level at which outliers have moved an estimate.
 MOVED = 0.05
 #: A treatment is rejected if its mean squared output error is this many times the least one of those compared.
@@ -300,11 +302,12 @@ class _Choosing:
         return 0.0, rounded(min(max(REACH * delay + FURTHER * step, 2.0 * FURTHER * step), delays[1]))
 
     def _latest(self, step: float) -> float:
-        """Return the greatest delay that is tried [s]; before a few steps an initial state needs some samples."""
+        """Return the greatest delay that is tried [s]; an initial state before a few steps needs half of the lead."""
         latest, first = greatest_delay(self.part), min(first_change(each) - each.t[0] for each in self.part)
         few = all(input_moves(each).kind == "steps" for record in self.part for each in record.each_input)
-        lead = float(first) - (LEAD + 1) * step
-        return latest if self.quiet or not few or lead < FURTHER * step else min(latest, lead)
+        moving = few and not all(begins_quietly(record, MOVING) for record in self.part)
+        lead = min(HALF * float(first), float(first) - (LEAD + 1) * step)
+        return min(latest, lead) if moving and lead >= FURTHER * step else latest
 
     def _interval_of(self, records: Sequence[Record]) -> float:
         """Return the length of the range of delays that the input can tell apart [s]; infinite without repetition."""
@@ -362,7 +365,7 @@ class _Choosing:
             # An output that is constant at first has no drift.
             settings = [each for each in with_offsets(settings, self.part) if not self.quiet or each.offset != "drift"]
         ranking = without_contradicted(self._compared(common, settings, structures, delays, start))
-        kept = without_needless_drift(ranking)
+        kept = without_needless_drift(ranking, few_changes(common))
         self.gains = gains_of_treatments(kept)
         best = self._treated(kept, delays[1])
         setting = Setting(self.first_hold, best.initial_state, best.input_before, best.offset)
@@ -579,16 +582,23 @@ def without_contradicted(ranking: Ranking) -> Ranking:
     return replace(ranking, candidates=tuple(e for e in ranking.candidates if least[_treatment_of(e)] <= most))
 
 
-def without_needless_drift(ranking: Ranking) -> Ranking:
+def without_needless_drift(ranking: Ranking, few: bool) -> Ranking:
     """Return the candidates without a drift of the output, unless it lowers the criterion decisively.
 
     A needless drift may describe a part of the response: in one case it replaced an integrator, with 8.6 times the
-    error. The estimated offset of an integrator is a drift too, and needs no lead.
+    error. The estimated offset of an integrator is a drift too, and needs no lead. After a few changes of the input the
+    criterion is that with own noise models, since a slow disturbance is no drift.
     """
     others = tuple(each for each in ranking.candidates if each.options.offset != "drift")
-    constant = [each.criterion for each in others if not each.options.integrators]
-    if not others or ranking.best.criterion < min(constant, default=-np.inf) - DECISIVE:
+    drifting = next((each for each in ranking.candidates if each.options.offset == "drift"), None)
+    if drifting is None or not others:
         return ranking
+    constant = next((each for each in others if not each.options.integrators), None)
+    if constant is not None and ranking.best.fit is drifting.fit:
+        criteria = [(each.criterion, own_criterion(each)) for each in (drifting, constant)]
+        falls = [other - one for one, other in zip(*criteria, strict=True)]
+        if falls[0] > DECISIVE and (not few or falls[1] > DECISIVE):
+            return ranking
     return replace(ranking, candidates=others)
 
 

@@ -24,6 +24,8 @@ from ctid_cli.errors import CtidError, DataError, OptionError
 from ctid_cli.estimation.measured_lines import MeasuredLines, lines_of
 from ctid_cli.estimators.frequency_domain import FrequencyDomain, FrequencyDomainFit
 from ctid_cli.identification.choice import Given
+from ctid_cli.identification.choose import rounded
+from ctid_cli.identification.criterion import BLOCKS, FOLDS, LEAST_SHARE, difference
 from ctid_cli.identification.response_structures import (
     ROUNDING,
     Family,
@@ -34,7 +36,8 @@ from ctid_cli.identification.response_structures import (
     noise_scale,
     white_over_lines,
 )
-from ctid_cli.inference.criteria import innovations_count, squared_innovations
+from ctid_cli.identification.sentences import shown
+from ctid_cli.inference.criteria import PENALTY, innovations_count, squared_innovations
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
 from ctid_cli.inference.response_test import LEVEL, ResponseTest
 from ctid_cli.processors import one_thread
@@ -42,15 +45,11 @@ from ctid_cli.progress import reported
 from ctid_cli.signals.frequency_data import FrequencyData
 from ctid_cli.text import count
 
-#: Penalty of a parameter over that in BIC, as for records.
-PENALTY = 1.5
 #: Most poles that are tried unasked, if these miss more than noise, and with peaks that need more; the grid ends this
 #: many poles above the best structure, and at this order at the least.
 MOST, MORE, GREATEST, BEYOND, FEWEST = 6, 10, 12, 2, 4
-#: Groups of lines that are held back together, and blocks whose errors are compared; fewest lines for that.
-FOLDS, BLOCKS, FEWEST_LINES = 5, 10, 30
-#: Errors below this share of the mean squared error of the best structure do not count.
-SHARE = 0.1
+#: Fewest lines of which some are held back.
+FEWEST_LINES = 30
 #: Standard errors by which a peak exceeds a model that misses it.
 MISSED = 5.0
 #: Greatest decrease of the gain with frequency [decades per decade] of a response that does not fall.
@@ -115,7 +114,7 @@ class _Choosing:
     def __init__(self, data: FrequencyData, given: Given) -> None:
         self.data, self.given, self.lines = data, given, lines_of(data)
         self.scale = noise_scale(self.lines.frequencies, self.lines.weights * self.lines.response)
-        self.reach = _rounded(greatest_delay(data, self.scale))
+        self.reach = rounded(greatest_delay(data, self.scale))
         self.peaks = clear_peaks(data, self._errors(self.scale))
         #: Order up to which structures are tried, and why it was raised.
         self.limit = max(MOST, min(2 * self.peaks.size, GREATEST))
@@ -242,15 +241,14 @@ class _Choosing:
         if not np.isfinite(errors[id(best)]).all():
             return (best._replace(taken=True), *ranked[1:])
         squares = {key: np.array([np.mean(own[blocks == k]) for k in range(BLOCKS)]) for key, own in errors.items()}
-        least = max(SHARE * float(np.mean(errors[id(best)])), np.finfo(float).tiny)
+        least = max(LEAST_SHARE * float(np.mean(errors[id(best)])), np.finfo(float).tiny)
         logs = {key: np.log(np.maximum(own, least)) for key, own in squares.items()}
         found, acceptable, missed = dict[int, Judged](), [id(best)], set(self._missed(best, best).tolist())
         for each in compared.values():
             key = id(each)
             if not np.isfinite(errors[key]).all():
                 continue
-            change = logs[key] - logs[id(best)]
-            mean, error = float(np.mean(change)), float(np.std(change, ddof=1) / np.sqrt(BLOCKS))
+            mean, error = difference(logs[key], logs[id(best)])
             held = float(np.mean(errors[key])) / max(best.fit.cost, np.finfo(float).tiny)
             found[key] = each._replace(held_back=held, difference=mean, standard_error=error)
             # A narrow peak may lie in one block only, whose error is then uncertain for all structures.
@@ -330,10 +328,10 @@ class _Choosing:
                 one for one in judged[1:] if (one.options.poles, one.options.zeros, one.options.integrators) != same
             )
             other = next(others, judged[1])
-            fall = f"the criterion is {_shown(other.criterion - best.criterion)} lower than with the runner-up"
+            fall = f"the criterion is {shown(other.criterion - best.criterion)} lower than with the runner-up"
             yield f"Structure: {taken.words}; {fall}, {other.words}."
         elif len(judged) > 1:
-            fall = f"{_shown(taken.criterion - best.criterion)} lower"
+            fall = f"{shown(taken.criterion - best.criterion)} lower"
             error = f"{taken.difference:.2g} +- {taken.standard_error:.1g}"
             yield (
                 f"Structure: {taken.words}, the smallest that predicts held-back lines as well as that of least "
@@ -359,7 +357,7 @@ class _Choosing:
         fall = ""
         if others:
             change, other = min(others) - own, "without" if free else "with"
-            fall = f"the criterion is {_shown(abs(change))} {'lower' if change >= 0.0 else 'higher'} than {other} one"
+            fall = f"the criterion is {shown(abs(change))} {'lower' if change >= 0.0 else 'higher'} than {other} one"
         searched = f"searched from 0 to {self.reach:g} {time} (--delay), 1.5 times the slope of the phase"
         return f"Delay: {searched if free else 'none (--delay 0)'}{f'; {fall}' * bool(fall)}."
 
@@ -388,15 +386,6 @@ def _about_weights(fit: FrequencyDomainFit) -> Iterator[str]:
     }
     weight = min(values, key=lambda name: values[name])
     if values[weight] < values["none"] - GROWS:
-        fall = _shown(2.0 * (values["none"] - values[weight]))
+        fall = shown(2.0 * (values["none"] - values[weight]))
         what = f"with --weight {weight} the deviance of the errors is {fall} lower"
         yield f"The errors grow with the gain, and all lines have the same weight: {what}"
-
-
-def _rounded(delay: float) -> float:
-    """Return a delay rounded to the three digits of the printed options."""
-    return float(f"{delay:.3g}")
-
-
-def _shown(fall: float) -> str:
-    return f"{fall:.0f}" if fall >= 100.0 else f"{fall:.3g}"

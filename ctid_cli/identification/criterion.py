@@ -11,6 +11,7 @@ from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.measured_fit import MeasuredFit, fitted
 from ctid_cli.identification.choice import Candidate, HeldBack, Ranking
 from ctid_cli.inference.criteria import (
+    DECISIVE,
     PENALTY,
     information_criteria,
     innovations_count,
@@ -31,6 +32,8 @@ BLOCKS, FEWEST_BLOCKS, FOLDS = 10, 2, 5
 LEAST_SHARE = 0.1
 #: Standard errors above the least errors of held-back blocks up to which others are acceptable.
 FARTHEST = 2.0
+#: Most changes of an input whose responses are few.
+FEW = 5
 #: Correlation of residuals one period later that chance gives, in standard deviations.
 CHANCE = 2.0
 
@@ -161,12 +164,32 @@ def judged(ranking: Ranking, records: Sequence[Record]) -> tuple[Ranking, Candid
         found |= {id(each): replace(each, held_back=own) for each, own in zip(tried, compared, strict=True)}
     accepted = [own for each in tried if (own := found[id(each)]).held_back is not None and own.held_back.acceptable]
     taken = min(accepted, key=lambda each: (each.size, each.criterion), default=best)
-    steps = all(input_moves(each).kind in ("constant", "steps") for record in records for each in record.each_input)
-    if steps and best.options.initial_state == "rest":
-        # The blocks of a few responses do not tell the order of a model.
-        alike = [each for each in first.values() if each.options.integrators == taken.options.integrators]
-        taken = found[id(min(alike, key=own_criterion))]
+    if few_changes(records):
+        taken = found[id(after_few_changes(list(first.values()), taken.options.integrators))]
     return replace(ranking, candidates=tuple(found[id(each)] for each in ranking.candidates)), taken
+
+
+def few_changes(records: Sequence[Record]) -> bool:
+    """Return whether all inputs change only a few times."""
+    moves = [input_moves(each) for record in records for each in record.each_input]
+    return all(one.kind != "continuous" and one.changes.size <= FEW for one in moves)
+
+
+def after_few_changes(candidates: Sequence[Candidate], integrators: int) -> Candidate:
+    """Return the candidate of least own criterion, with the number of integrators that held-back blocks decide on.
+
+    The blocks of a few responses do not tell the order of a model. With an estimated state an integrator may also be a
+    drift, unless the evidence is very strong.
+    """
+    without, with_one = (
+        min((each for each in candidates if bool(each.options.integrators) is some), key=own_criterion, default=None)
+        for some in (False, True)
+    )
+    if without is None or with_one is None:
+        return min(candidates, key=own_criterion)
+    if candidates[0].options.initial_state == "estimate":
+        integrators = int(own_criterion(with_one) < own_criterion(without) - DECISIVE)
+    return with_one if integrators else without
 
 
 def own_criterion(candidate: Candidate) -> float:
@@ -206,14 +229,14 @@ def held_back(candidates: Sequence[tuple[Candidate, Sequence[Record]]]) -> list[
             found.append(None)
             continue
         percent = percent_from_r_squared(1.0 - float(squared.mean()) / total)
-        first, least_ones = (_difference(size, other) for other in (sizes[0], lowest))
+        first, least_ones = (difference(size, other) for other in (sizes[0], lowest))
         acceptable = first[0] <= first[1] and least_ones[0] <= FARTHEST * least_ones[1]
         found.append(HeldBack(percent, *first, acceptable))
     return found
 
 
-def _difference(one: Array, other: Array) -> tuple[float, float]:
-    """Return the mean difference of blocks and its standard error."""
+def difference(one: Array, other: Array) -> tuple[float, float]:
+    """Return the mean difference of the errors of blocks and its standard error."""
     ratios = one - other
     return float(ratios.mean()), float(ratios.std(ddof=1) / np.sqrt(ratios.size))
 

@@ -18,9 +18,6 @@ from ctid_cli.processors import one_thread
 from ctid_cli.signals.frequency_data import FrequencyData
 from ctid_cli.text import probability
 
-#: Least decrease of the criterion from which a delay is missing, very strong evidence by Kass and Raftery (1995).
-DECISIVE = 10.0
-
 
 @one_thread
 def identify_frequency_response(

@@ -145,5 +145,9 @@ def of_criterion(ranking: Ranking) -> str:
 
 
 def _lower(best: Candidate, other: Candidate) -> str:
-    fall = other.criterion - best.criterion
-    return f"the criterion is {fall:.0f} lower" if fall >= 100 else f"the criterion is {fall:.3g} lower"
+    return f"the criterion is {shown(other.criterion - best.criterion)} lower"
+
+
+def shown(fall: float) -> str:
+    """Return a difference of criteria with three digits."""
+    return f"{fall:.0f}" if fall >= 100.0 else f"{fall:.3g}"

@@ -112,8 +112,11 @@ FEW_REPEATED = 0.02
 GROWTH = 4.0
 
 
-def begins_quietly(record: Record) -> bool:
-    """Return whether a record begins at rest: with constant inputs, longer than later ones, and a constant output."""
+def begins_quietly(record: Record, share: float = QUIET_SHARE) -> bool:
+    """Return whether a record begins at rest: with constant inputs, longer than later ones, and a constant output.
+
+    The output may move by a share of its deviation.
+    """
     moves = [input_moves(each) for each in record.each_input]
     changes = np.concatenate([one.changes for one in moves])
     if any(one.kind == "continuous" for one in moves) or not changes.size:
@@ -128,7 +131,7 @@ def begins_quietly(record: Record) -> bool:
         return False
     blocks = before[before.size - size * QUIET_BLOCKS :].reshape(QUIET_BLOCKS, size)
     means, inner = blocks.mean(axis=1), blocks - blocks.mean(axis=1, keepdims=True)
-    if np.ptp(means) < QUIET_SHARE * float(y.std()):
+    if np.ptp(means) < share * float(y.std()):
         return True
     variance = float(np.sum(inner**2)) / (QUIET_BLOCKS * (size - 1))
     # The variance of a mean of autoregressive noise of order 1 is (1 + r)/(1 - r) times that of white noise.
