@@ -28,22 +28,10 @@ StructureFit = tuple[DelayProfile, MeasuredFit, int]
 
 
 class StructureFits:
-    """Fits of structures with one number of integrators.
+    """Fits of structures with one number of integrators, in the treatment, range and holds of given options.
 
-    Parameters
-    ----------
-    records : sequence of Record
-        Records with their holds.
-    treated : DelayProfile
-        Treatment, range of the delay, and number of integrators; its numbers of poles and zeros are replaced.
-    alone : mapping, optional
-        Further options, known parameters for example, with which each structure has its own search.
-    first_delays : tuple of float, optional
-        Delays of several inputs from which searches start [s].
-    fewer_zeros : bool
-        Whether each of several inputs may have fewer zeros than its structure.
-    near : callable, optional
-        Models with numbers of poles and zeros from which all searches start; None if there is none.
+    Options ``alone``, known parameters for example, give each structure its own search. Searches of several inputs start
+    from ``first_delays``, and each input may have ``fewer_zeros``. With models ``near``, searches start from these only.
     """
 
     def __init__(
