@@ -30,8 +30,9 @@ StructureFit = tuple[DelayProfile, MeasuredFit, int]
 class StructureFits:
     """Fits of structures with one number of integrators, in the treatment, range and holds of given options.
 
-    Options ``alone``, known parameters for example, give each structure its own search. Searches of several inputs start
-    from ``first_delays``, and each input may have ``fewer_zeros``. With models ``near``, searches start from these only.
+    Options ``alone``, known parameters for example, give each structure its own search. Searches of several inputs
+    start from ``first_delays``, and each input may have ``fewer_zeros``. Searches start only from models ``near`` if
+    these are given.
     """
 
     def __init__(

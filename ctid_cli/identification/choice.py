@@ -137,7 +137,9 @@ class Given:
 
     @property
     def span(self) -> Span:
-        """Admitted structures of transfer functions with one number of poles and zeros."""
+        """Admitted structures of transfer functions; of sums those with which treatments are compared."""
+        if self.modes is not None:
+            return Span(integrators=(self.integrators or 0,))
         poles, zeros = (
             (each, each) if isinstance(each, int) else each or (0, MOST_POLES) for each in (self.poles, self.zeros)
         )

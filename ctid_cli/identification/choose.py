@@ -163,6 +163,7 @@ class _Choosing:
         #: Delays of several inputs in the best small model, from which searches start [s], and fits of small models.
         self.first_delays: tuple[float, ...] | None = None
         self.near: dict[int, StructureFits] = {}
+        self.structures: list[Structure] = []
         self.gains: dict[str, tuple[float, ...]] = {}
         self.holds: tuple[Holds, ...] = ()
         self.reasons: list[str] = []
@@ -170,13 +171,20 @@ class _Choosing:
     def choice(self) -> Choice:
         """Return the choice."""
         delays = self._range()
-        setting = self._setting(delays, self._small(delays))
+        setting = self._setting(delays, self.structures or self._small(delays))
         ranking, taken = self._structure(setting, delays)
-        if not (self.given.single or self.given.modes):
+        tried = [setting]
+        while not (self.given.single or self.given.modes):
+            reasons = self.reasons
             confirmed = self._setting(delays, [structure_of(taken)], taken)
-            if confirmed != setting:
-                # A state may make up for the dynamics that small models miss.
-                setting, (ranking, taken) = confirmed, self._structure(confirmed, delays)
+            if confirmed == setting:
+                break
+            if confirmed in tried:
+                self.reasons = [*reasons, sentences.of_contradiction(*confirmed[1:])]
+                break
+            # A state may make up for the dynamics that small models miss.
+            setting, (ranking, taken) = confirmed, self._structure(confirmed, delays)
+            tried.append(setting)
         about = sentences.of_grid(ranking, taken, delays, self.given, self.time_unit)
         given, options = self.given, replace(taken.options, loss=self.given.loss or "squares")
         options = replace(options, noise_model=given.noise_model)
@@ -230,7 +238,7 @@ class _Choosing:
         alone: dict[str, Any] = {"inputs": given.inputs} if given.typed else {}
         alone |= {"fixed": given.fixed} if given.fixed else {}
         alone |= {"bounds": given.bounds} if given.bounds else {}
-        fewer = self.several and not isinstance(given.zeros, int)
+        fewer = self.several and not isinstance(given.zeros, int) and near is None
         held = [with_hold(record, hold) for record in records]
         return StructureFits(held, treated, alone, self.first_delays, fewer_zeros=fewer, near=near)
 
@@ -288,13 +296,17 @@ class _Choosing:
             # Assuming rest may bias the delay; an estimated state does not.
             settings = self._settings(delays[1])
             settings = settings[:1] if self.quiet else settings[-1:]
-            structures = self._small(delays, 3 if self.several else 2)
+            structures = self._small(delays, 2)
             ranking = self._compared(self._common(settings, delays[1]), settings, structures, delays)
             delay = max(delays_of(ranking.best.fit.model))
             if delays[1] >= farthest or delay <= AT_END * delays[1]:
                 break
             delays = 0.0, rounded(min(2.0 * delays[1], farthest))
-        self.first_delays = tuple(delays_of(ranking.best.fit.model)) if self.several else None
+        if self.several:
+            # Searches take long: the best structures found are enough for the treatment.
+            self.first_delays = tuple(delays_of(ranking.best.fit.model))
+            each = [ranking.of(integrators=k) for k in self.span.integrators]
+            self.structures = [structure_of(one.best) for one in each if one is not None]
         if given is not None:
             return given
         if self.repeats:

@@ -5,6 +5,7 @@ from ctid_cli.estimators.identification import Options
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.identification.choice import MOST_POLES, Candidate, Given, Ranking, Searched
 from ctid_cli.inference.criteria import DECISIVE, PENALTY
+from ctid_cli.signals.treatment import InitialState, InputBefore, Offset
 from ctid_cli.text import count, listed
 
 #: Sentence if the beginning of a record is not used.
@@ -57,6 +58,15 @@ def of_assumed(options: Searched, quiet: bool) -> str:
     else:
         why = "this is assumed, as the input does not change enough after the longest delay to estimate a state"
     return f"State before the record: {_state(options)}; {why}."
+
+
+def of_contradiction(state: InitialState, before: InputBefore, offset: Offset) -> str:
+    """State that another treatment is better with the final structure, and why it was not taken."""
+    level = "" if state != "rest" else f" --input-before {'first' if before == 'first' else f'{before or 0:g}'}"
+    return (
+        f"With this structure --initial-state {state}{level} --offset {offset} has a lower criterion; it was not "
+        "taken, since structures fitted with it lead to another structure, with which this treatment is better."
+    )
 
 
 def of_state(rest: Candidate, estimated: Candidate, likely: bool) -> str:

@@ -187,6 +187,48 @@ def test_the_decrease_of_the_criterion_is_that_of_a_model():
     assert promised * (1 - 1e-4) <= squared <= at_fit * (1 + 1e-9)
 
 
+def choices_of(integrators, own, state="rest"):
+    """Return the integrators of the model chosen after few changes, for own criteria without and with one."""
+    best = choice_of(SECOND, ONE).taken
+    before = "first" if state == "rest" else None
+    pair = [
+        replace(best, options=replace(best.options, integrators=k, initial_state=state, input_before=before), size=k)
+        for k in (0, 1)
+    ]
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(criterion, "own_criterion", lambda each: own[each.options.integrators])
+        return criterion.after_few_changes(pair, integrators).options.integrators
+
+
+@pytest.mark.parametrize(
+    ("blocks", "own", "state", "chosen"),
+    [
+        (1, (0.0, 5.0), "rest", 1),
+        (0, (5.0, 0.0), "rest", 0),
+        # With an estimated state only very strong evidence is one of an integrator.
+        (1, (5.0, 0.0), "estimate", 0),
+        (0, (15.0, 0.0), "estimate", 1),
+    ],
+)
+def test_after_a_few_changes_blocks_decide_on_the_integrator_from_rest(blocks, own, state, chosen):
+    assert choices_of(blocks, own, state) == chosen
+
+
+def test_another_number_of_integrators_that_fits_as_well_is_named():
+    # A short step response of an integrator with little lag is also that of a slow pole.
+    record = record_of(TransferFunction([0.2], [1.0, 0.002]), u=step(30, 200), deviation=0.05, count=200)
+    choice = choose(record, Given(zeros=0, delay_bounds=(0.0, 0.0)))
+    (said,) = (text for text in choice.sentences if "fits as well: the criterion of" in text)
+    assert f"(--integrators {1 - choice.options.integrators})" in said
+
+
+def test_more_than_six_poles_are_tried_if_asked():
+    made = TransferFunction([1.0], np.poly([-1.0, -1.1, -1.2, -1.3]))
+    tried = choose(record_of(made, deviation=1e-5), Given(poles=(6, 7), zeros=0, integrators=0)).ranking.candidates
+    assert {each.options.poles for each in tried} == {6, 7}
+    assert Given().span.orders(unasked=True)[-1] == 6
+
+
 @pytest.mark.parametrize(("repeated", "least", "most"), [(1.0, 0.1, 0.12), (0.0, 0.6, 1.0)])
 def test_a_residual_that_repeats_with_the_input_counts_once(repeated, least, most):
     # Ten half periods of a square wave.

@@ -105,3 +105,26 @@ def test_a_gain_whose_sign_differs_between_treatments_is_not_determined(behind, 
     )
     pair = replace(ranking, candidates=(replace(best, fit=replace(best.fit, model=model)), other))
     assert gains_of_treatments(pair) == expected
+
+
+def test_a_level_that_the_output_contradicts_is_not_taken():
+    # Whitened by the noise model of slow residuals, a wrong level before the record has nearly the same innovations.
+    u = binary()
+    early = record_of(u=u, noise=0.0)
+    record = Record.from_arrays(early.t[:-1], u[:-1], early.y[1:], "zoh")
+    options = choose(
+        record, Given(poles=2, zeros=0, delay_bounds=(0.0, 0.0), initial_state="rest", offset="none")
+    ).options
+    costs = [replace(options, input_before=level).fit(record).cost for level in ("first", None)]
+    chosen = costs[0] if options.input_before == "first" else costs[1]
+    assert chosen < 4.0 * min(costs)
+
+
+def test_a_record_that_moves_before_its_step_has_a_state():
+    u = np.where(np.arange(400) < 140, 0.0, 1.0)
+    u[:60] = -1.0
+    record = record_of(TransferFunction([1.0], [1.0, 0.8]), u=u, noise=0.01, past=70)
+    found = identify(record)
+    assert found.options.initial_state == "estimate"
+    assert found.options.integrators == 0
+    assert gain_of(found).low < 1.25 < gain_of(found).high

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from ctid_cli.estimation.optimum import chain
+from ctid_cli.estimation.optimum import chain, projection
 from ctid_cli.estimation.optimum.arrangement import with_one_denominator
 from ctid_cli.estimation.optimum.box import Box, point_of
 from ctid_cli.estimation.optimum.chain import Chain, Modal, chain_dynamics, forms_of, numerators, poles_of
@@ -177,3 +177,17 @@ def test_two_submodels_of_one_input_are_fractions_of_two_inputs_that_are_the_sam
     each = slopes(two, speed, damping, (delay, delay), there, (0, 1))
     np.testing.assert_allclose(each.gradient[:-2], single.gradient[:-1], rtol=1e-6)
     assert each.gradient[-2:].sum() == pytest.approx(single.gradient[-1], rel=1e-6)
+
+
+def test_a_response_that_overflows_explains_nothing(monkeypatch):
+    record = record_of(MODEL, np.random.default_rng(1), noise=0.1)
+    problem = problem_of(record, 2)
+    whole = projection._columns
+
+    def overflowing(*of):
+        phi, y = whole(*of)
+        return np.full_like(phi, np.nan), y
+
+    monkeypatch.setattr(projection, "_columns", overflowing)
+    found = project(problem, SPEED, DAMPING, Delay(0.0, -1)).squared_error
+    np.testing.assert_allclose(found, float(record.y @ record.y), rtol=1e-9)
