@@ -98,6 +98,14 @@ def whole_number(text: str) -> int:
         raise typer.BadParameter(f"must be a whole number; got {text!r}") from None
 
 
+def degree(text: str) -> int | tuple[int, int]:
+    """Return a whole number, or a range to choose from."""
+    found = span(text, int)
+    if found is None or not 0 <= found[0] <= found[1]:
+        raise typer.BadParameter(f"must be a whole number, or LOW:HIGH to choose from; got {text!r}")
+    return found if ":" in text else found[0]
+
+
 def delay_range(text: str) -> tuple[float, float]:
     """Return a range of the delay; a single value is a known delay."""
     bounds = span(text, float)
@@ -182,9 +190,12 @@ class FitOptions(StructureOptions):
     """Structure of the model, its known parameters and bounds, noise, and hold of the input."""
 
     poles: Annotated[
-        NamedValues, named("--poles", "Poles; INPUT=N: separate denominators.", "[INPUT=]N", whole_number)
+        NamedValues,
+        named("--poles", "INPUT=N: separate denominators.", "[INPUT=]N|LOW:HIGH", degree),
     ] = None
-    zeros: Annotated[NamedValues, named("--zeros", "Zeros, fewer than poles.", "[INPUT=]N", whole_number)] = None
+    zeros: Annotated[
+        NamedValues, named("--zeros", "Zeros, fewer than poles, or their range.", "[INPUT=]N|LOW:HIGH", degree)
+    ] = None
     model: FormOption = "fraction"
     terms: Annotated[str | None, flag("--terms", "Poles/zeros of each submodel; else chosen.", "P/Z,P/Z,...")] = None
     fix: Annotated[NamedValues, named("--fix", "Hold a parameter; repeatable.", "NAME=VALUE", finite)] = None
@@ -292,6 +303,7 @@ class ModelRequest:
             for name in {*options.each(option)} - {"", *self.inputs}:
                 known = f"the inputs are {', '.join(self.inputs)}" if self.inputs else "name several with --input"
                 raise UsageError(f"{OPTIONS[option]} is given for {name!r}, which is no input; {known}")
+        self._check_ranges()
         if options.common("integrators") and options.offset in ("remove", "drift"):
             raise UsageError(
                 f"--offset {options.offset} does not go with --integrators, since the output of an integrating system "
@@ -299,6 +311,16 @@ class ModelRequest:
             )
         if self.single:
             self._check_loop(given)
+
+    def _check_ranges(self) -> None:
+        """Refuse ranges of degrees where nothing is chosen, or one number is needed."""
+        options = self.options
+        for option in ("poles", "zeros"):
+            ranges = [name for name, value in options.each(option).items() if isinstance(value, tuple)]
+            needed = "single inputs" if any(ranges) else "--fix" if options.fix else "--bound" if options.bound else ""
+            needed = needed or ("a record in a loop" if self.single else "")
+            if ranges and needed:
+                raise UsageError(f"--{option} must be one number with {needed}, not a range")
 
     def _check_loop(self, given: Sequence[str]) -> None:
         """Refuse options that the estimators of a record in a loop do not have."""

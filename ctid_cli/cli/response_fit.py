@@ -80,8 +80,8 @@ def frequency_fit(
     with as_usage_errors():
         delays: Any = options.common("delay_bounds") or (0.0, 0.0)
         estimator: FrequencyDomain | FrequencyDomainSum | Given
-        if not request.is_sum and poles is None:
-            estimator = Given(None, zeros, integrators, options.common("delay_bounds"))
+        if not request.is_sum and (poles is None or isinstance(poles, tuple) or isinstance(zeros, tuple)):
+            estimator = Given(poles, zeros, integrators, options.common("delay_bounds"))
         elif request.is_sum:
             estimator = FrequencyDomainSum(options.submodels, delays, fixed=options.fixed)
         else:

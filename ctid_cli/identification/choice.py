@@ -43,7 +43,7 @@ class Span(NamedTuple):
     def orders(self, unasked: bool) -> range:
         """Return the numbers of poles, integrators included."""
         most = self.poles[1] + max(self.integrators)
-        return range(1, (min(most, MOST_POLES) if unasked else most) + 1)
+        return range(1, (min(most, max(MOST_POLES, self.zeros[0] + 1)) if unasked else most) + 1)
 
     def structures(self, order: int, integrators: int, delay_free: bool) -> Iterator[tuple[int, int]]:
         """Yield poles and zeros of all structures of an order, integrators included."""
@@ -119,11 +119,11 @@ class Given:
         """Whether degrees of single inputs are given, so that no structure is chosen."""
         return any((one.poles, one.zeros, one.integrators) != (None,) * 3 for one in self.inputs or ())
 
-    @property
-    def delays_given(self) -> tuple[float, float] | None:
-        """Range that contains the delays of all inputs; None if one of them is to be chosen."""
-        own = [one.delay_bounds for one in self.inputs or ()]
-        given = [self.delay_bounds if bounds is None else bounds for bounds in own] or [self.delay_bounds]
+    def delays_given(self, record: Record) -> tuple[float, float] | None:
+        """Return the range that contains the delays of all inputs of a record; None if one of them is to be chosen."""
+        own = {one.name: one.delay_bounds for one in self.inputs or ()}
+        names = record.held if record.several else ("",)
+        given = [self.delay_bounds if own.get(name) is None else own[name] for name in names]
         known = [bounds for bounds in given if bounds is not None]
         if len(known) < len(given):
             return None
@@ -140,9 +140,10 @@ class Given:
         """Admitted structures of transfer functions; of sums those with which treatments are compared."""
         if self.modes is not None:
             return Span(integrators=(self.integrators or 0,))
-        poles, zeros = (
-            (each, each) if isinstance(each, int) else each or (0, MOST_POLES) for each in (self.poles, self.zeros)
-        )
+        zeros = (self.zeros, self.zeros) if isinstance(self.zeros, int) else self.zeros
+        most = max(MOST_POLES, zeros[0] + 1 if zeros else 0)
+        poles = (self.poles, self.poles) if isinstance(self.poles, int) else self.poles or (0, most)
+        zeros = zeros or (0, poles[1] + 1)
         none = isinstance(self.poles, int) or self.offset in ("remove", "drift") or self.initial_state == "periodic"
         free = (0,) if none else (0, 1)
         return Span(poles, zeros, free if self.integrators is None else (self.integrators,))

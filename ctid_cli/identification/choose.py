@@ -124,9 +124,9 @@ def choose(records: Record | Sequence[Record], given: Given | None = None, time_
     several = as_records(records)
     given = given or Given()
     given.check()
-    if given.delays_given is not None:
+    if (known := given.delays_given(several[0])) is not None:
         for record in several:
-            check_greatest_delay(record, given.delays_given[1])
+            check_greatest_delay(record, known[1])
     choice = _Choosing(several, given, time_unit).choice()
     if given.loss is not None or given.noise_model != "white":
         return choice
@@ -158,6 +158,7 @@ class _Choosing:
         self.span = span._replace(integrators=(0,)) if self.ramps else span
         self.inputs = self._ranges_of_inputs()
         self.first_hold: Holds = "zoh" if given.hold == "auto" else given.hold
+        self.first_hold = self._holds()[0]
         #: Whether the input repeats: its range of delays is kept whole.
         self.repeats = False
         #: Delays of several inputs in the best small model, from which searches start [s], and fits of small models.
@@ -175,17 +176,18 @@ class _Choosing:
         ranking, taken = self._structure(setting, delays)
         tried = [setting]
         while not (self.given.single or self.given.modes):
-            reasons = self.reasons
+            kept = self.reasons, self.gains, self.holds
             confirmed = self._setting(delays, [structure_of(taken)], taken)
             if confirmed == setting:
                 break
             if confirmed in tried:
-                self.reasons = [*reasons, sentences.of_contradiction(*confirmed[1:])]
+                reasons, self.gains, self.holds = kept
+                self.reasons = [*reasons, sentences.of_contradiction(*confirmed)]
                 break
             # A state may make up for the dynamics that small models miss.
             setting, (ranking, taken) = confirmed, self._structure(confirmed, delays)
             tried.append(setting)
-        about = sentences.of_grid(ranking, taken, delays, self.given, self.time_unit)
+        about = sentences.of_grid(ranking, taken, few_changes(self.part), delays, self.given, self.time_unit)
         given, options = self.given, replace(taken.options, loss=self.given.loss or "squares")
         options = replace(options, noise_model=given.noise_model)
         if not self.from_start:
@@ -210,7 +212,10 @@ class _Choosing:
     def _small(self, delays: tuple[float, float], most: int = 3) -> list[Structure]:
         """Return the structures with which settings are compared: the given one, or small ones."""
         if self.given.typed:
-            return [(self.given.integrators or 0, self.given.poles or 1, self.given.zeros or 0)]  # type: ignore[list-item]
+            poles, zeros = (
+                each[0] if isinstance(each, tuple) else each for each in (self.given.poles, self.given.zeros)
+            )
+            return [(self.given.integrators or 0, 1 if poles is None else poles, zeros or 0)]
         free = delays[0] < delays[1]
         return [(k, *each) for k in self.span.integrators for each in self.span.small(k, free, most)]
 
@@ -282,7 +287,7 @@ class _Choosing:
     @reported("range of the delay")
     def _range(self) -> tuple[float, float]:
         """Return the range of the delay [s]."""
-        given = self.given.delays_given
+        given = self.given.delays_given(self.part[0])
         if given is not None and not self.several:
             return given
         interval = np.inf if self.several else self._interval_of(self.part)
@@ -404,9 +409,10 @@ class _Choosing:
             at_rest = rest.best.criterion <= estimated.best.criterion - lead
             likely = not at_rest or beginning_is_likely(rest.best, models.noise, self.part, self._longest(latest))
             chosen = rest if at_rest and likely else estimated
-            self.reasons.append(sentences.of_state(rest.best, estimated.best, likely))
+            pair = rest.best, estimated.best
+            self.reasons.append(sentences.of_state(*(pair if chosen is rest else pair[::-1]), likely))
         elif self.given.initial_state is None:
-            assumed = sentences.of_assumed(models.best.options, self.quiet)
+            assumed = sentences.of_assumed(models.best.options, self.given, self.quiet)
             self.reasons.append(assumed if self.from_start else sentences.STATE_OF_PART)
         if self.given.offset is None:
             self.reasons.append(sentences.of_setting(chosen, "offset"))

@@ -117,7 +117,8 @@ class _Choosing:
         self.reach = rounded(greatest_delay(data, self.scale))
         self.peaks = clear_peaks(data, self._errors(self.scale))
         #: Order up to which structures are tried, and why it was raised.
-        self.limit = max(MOST, min(2 * self.peaks.size, GREATEST))
+        fewest = given.zeros if isinstance(given.zeros, int) else (given.zeros or (0, 0))[0]
+        self.limit = max(MOST, min(2 * self.peaks.size, GREATEST), fewest + 1)
         self.why = f"the response has {count(self.peaks.size, 'clear peak')}"
 
     def _errors(self, scale: float) -> Array:

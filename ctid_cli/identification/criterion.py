@@ -12,6 +12,7 @@ from ctid_cli.estimators.measured_fit import MeasuredFit, fitted
 from ctid_cli.identification.choice import Candidate, HeldBack, Ranking
 from ctid_cli.inference.criteria import (
     DECISIVE,
+    OWN_PENALTY,
     PENALTY,
     information_criteria,
     innovations_count,
@@ -32,12 +33,10 @@ BLOCKS, FEWEST_BLOCKS, FOLDS = 10, 2, 5
 LEAST_SHARE = 0.1
 #: Standard errors above the least errors of held-back blocks up to which others are acceptable.
 FARTHEST = 2.0
-#: Most changes of an input whose responses are few, and penalty of a parameter, over that in BIC, in a criterion with
-#: own noise models. With 1.5, 2 and 3 the geometric mean of the errors of 28 models of simulated steps was .99, .96 and
-#: 1.01 of that with a common noise model; of 19 of thermal steps 3, 2 and none had oscillations.
-FEW, OWN_PENALTY = 5, 2.0
-#: Correlation of residuals one period later that chance gives, in standard deviations.
-CHANCE = 2.0
+#: Most changes of an input whose responses are few.
+FEW_RESPONSES = 5
+#: Correlation of residuals one period later that chance gives, in standard deviations, and fewest pairs for it.
+CHANCE, FEWEST_PAIRS = 2.0, 10
 
 
 def ranked(
@@ -85,7 +84,10 @@ def independent_share(fit: MeasuredFit, records: Sequence[Record]) -> float:
         lag, whole = round(shift.shift / step), np.full(use.size, np.nan)
         whole[use] = e
         pairs = shift.sign * whole[lag:] * whole[: whole.size - lag]
-        repeated.append(float(np.nanmean(pairs) / np.mean(e**2)) - CHANCE / np.sqrt(e.size))
+        pairs = pairs[np.isfinite(pairs)]
+        if pairs.size < FEWEST_PAIRS:
+            return 1.0
+        repeated.append(float(np.mean(pairs) / np.mean(e**2)) - CHANCE / np.sqrt(pairs.size))
         periods.append(e.size / lag)
     return 1.0 / (1.0 + (float(np.mean(periods)) - 1.0) * max(float(np.mean(repeated)), 0.0))
 
@@ -174,7 +176,7 @@ def judged(ranking: Ranking, records: Sequence[Record]) -> tuple[Ranking, Candid
 def few_changes(records: Sequence[Record]) -> bool:
     """Return whether all inputs change only a few times."""
     moves = [input_moves(each) for record in records for each in record.each_input]
-    return all(one.kind != "continuous" and one.changes.size <= FEW for one in moves)
+    return all(one.kind != "continuous" and one.changes.size <= FEW_RESPONSES for one in moves)
 
 
 def after_few_changes(candidates: Sequence[Candidate], integrators: int) -> Candidate:

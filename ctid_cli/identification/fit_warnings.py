@@ -12,7 +12,7 @@ from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Identification, unsafe_intervals
 from ctid_cli.estimators.measured_fit import MeasuredFit, MultiInputFit, delay_names
 from ctid_cli.estimators.reported_parameters import direction_names, free_directions
-from ctid_cli.identification.choice import Candidate, Given, fit_options, zero_on_integrator
+from ctid_cli.identification.choice import Candidate, Choice, Given, HeldBack, fit_options, zero_on_integrator
 from ctid_cli.identification.choose import choose
 from ctid_cli.identification.criterion import held_back, refitted
 from ctid_cli.identification.sentences import outlying, spelled
@@ -101,20 +101,32 @@ def _of_choice(found: Identification, free: Given, time_unit: str) -> Iterator[s
         return
     try:
         choice = choose(found.records, free, time_unit)
+        own, other = _held_back_of(found, choice)
     except DataError as error:
         yield f"No structure could be chosen for comparison: {str(error).removesuffix('.')}"
         return
-    records = choice.fitted
+    if not choice.has_model or own is None or other is None or own.acceptable:
+        return
+    before, after = fit_options(options, found.records[0]), fit_options(choice.options, choice.records[0])
+    typed = [*before, *["--fix"] * bool(options.fixed), *["--bound"] * bool(options.bounds)]
+    old, new = ([word for text in texts for word in text.split() if word.startswith("--")] for texts in (typed, after))
+    dropped = list(dict.fromkeys(word for word in old if word not in new))
+    words = " ".join(text for text in after if text not in before) or "the same options"
+    words += f" and without {listed(dropped)}" * bool(dropped)
+    fits = f"{other.percent:.1f} instead of {own.percent:.1f} %"
+    yield f"A free choice takes {spelled(choice.options)}: with {words} the held-back fit is {fits}"
+
+
+def _held_back_of(found: Identification, choice: Choice) -> tuple[HeldBack | None, HeldBack | None]:
+    """Return the errors of held-back blocks of a fit and of a choice."""
+    options, records = found.options, choice.fitted
+    assert isinstance(options, DelayProfile)
     moved = any(part.t[0] > record.t[0] for part, record in zip(records, found.records, strict=True))
     treated = replace(options, initial_state="estimate", input_before=None) if moved else options
     held = [with_hold(record, found.records[0].hold) for record in records]
-    given = refitted(Candidate(treated, found.records[0].hold, fit, choice.taken.size), held)
+    given = refitted(Candidate(treated, found.records[0].hold, found.fit, choice.taken.size), held)
     other, own = held_back([(refitted(choice.taken, records), records), (given, held)])
-    if choice.has_model and own is not None and other is not None and not own.acceptable:
-        before = fit_options(options, found.records[0])
-        words = " ".join(text for text in fit_options(choice.options, choice.records[0]) if text not in before)
-        chosen = f"A free choice takes {spelled(choice.options)}: with {words}"
-        yield f"{chosen} the held-back fit is {other.percent:.1f} instead of {own.percent:.1f} %"
+    return own, other
 
 
 def _dependence(found: Identification, least: float = 0.05) -> str:

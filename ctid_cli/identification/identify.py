@@ -90,10 +90,11 @@ def identify(
         likely = found.fit.assumed_hold.others if found.fit.assumed_hold else ()
         before = getattr(options, "input_before", None)
         freely = Given(hold=several[0].hold, input_before=before if isinstance(before, float | int) else None)
+        freely = replace(freely, initial_state="periodic") if options.initial_state == "periodic" else freely
         return with_warnings(joined_with_holds(found, likely), time_unit, freely)
     given = options or Given()
     choice = choose(several, given, time_unit)
-    if given.poles is None and not choice.has_model:
+    if given.poles is None and not given.typed and not choice.has_model:
         what = "number of poles (--poles)" if given.modes is None else "submodels (--terms)"
         raise DataError(
             f"{choice.why_no_model} Input and output may be exchanged; else give the {what} to fit a model "
@@ -106,10 +107,11 @@ def identify(
     found = identification.identify(choice.options, choice.records, None, *noise)
     found = replace(found, choices=choice.sentences)
     found = joined_with_holds(with_other_gains(found, choice), choice.holds)
-    if not (given.typed or (isinstance(given.poles, int) and isinstance(given.zeros, int))):
+    if not given.single:
         found = joined_with_larger(found, choice)
     if other is not None:
         found = replace(found, validation=validated_on(other, choice.options, found.fit, given))
     typed = given.typed or isinstance(given.poles, int)
-    free = Given(hold=given.hold, input_before=given.input_before, loss=given.loss) if typed else None
-    return with_warnings(found, time_unit, free)
+    periodic = given.initial_state if given.initial_state == "periodic" else None
+    free = Given(initial_state=periodic, hold=given.hold, input_before=given.input_before, loss=given.loss)
+    return with_warnings(found, time_unit, free if typed else None)

@@ -4,8 +4,8 @@ from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.identification import Options
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.identification.choice import MOST_POLES, Candidate, Given, Ranking, Searched
-from ctid_cli.inference.criteria import DECISIVE, PENALTY
-from ctid_cli.signals.treatment import InitialState, InputBefore, Offset
+from ctid_cli.inference.criteria import DECISIVE, OWN_PENALTY, PENALTY
+from ctid_cli.signals.treatment import Holds, InitialState, InputBefore, Offset
 from ctid_cli.text import count, listed
 
 #: Sentence if the beginning of a record is not used.
@@ -49,10 +49,12 @@ def of_outliers(number: int) -> str:
     return f"Loss: tukey (--loss), as {outlying(number)}; all else is chosen without {'it' if number == 1 else 'them'}."
 
 
-def of_assumed(options: Searched, quiet: bool) -> str:
+def of_assumed(options: Searched, given: Given, quiet: bool) -> str:
     """State the only state before the record that was left to compare, and why."""
     if options.initial_state == "estimate":
         why = "the output error from rest is more than twice as large"
+    elif given.input_before is not None:
+        why = "the input before the record is given"
     elif quiet:
         why = "the output is constant until the input changes"
     else:
@@ -60,25 +62,27 @@ def of_assumed(options: Searched, quiet: bool) -> str:
     return f"State before the record: {_state(options)}; {why}."
 
 
-def of_contradiction(state: InitialState, before: InputBefore, offset: Offset) -> str:
+def of_contradiction(hold: Holds, state: InitialState, before: InputBefore, offset: Offset) -> str:
     """State that another treatment is better with the final structure, and why it was not taken."""
     level = "" if state != "rest" else f" --input-before {'first' if before == 'first' else f'{before or 0:g}'}"
     return (
-        f"With this structure --initial-state {state}{level} --offset {offset} has a lower criterion; it was not "
+        f"With this structure --initial-state {state}{level} --offset {offset} --hold "
+        f"{hold if isinstance(hold, str) else ' --hold '.join(hold)} has a lower criterion; it was not "
         "taken, since structures fitted with it lead to another structure, with which this treatment is better."
     )
 
 
-def of_state(rest: Candidate, estimated: Candidate, likely: bool) -> str:
+def of_state(taken: Candidate, other: Candidate, likely: bool) -> str:
     """Describe the state, and by how much it is better than the other."""
     if not likely:
         return (
             "State before the record: estimated, as the first samples are not those of a system at rest "
             "(--initial-state estimate)."
         )
-    best, other = sorted((rest, estimated), key=lambda each: each.criterion)
-    fall = f"{_lower(best, other)} than if it is {_state(other.options)}"
-    return f"State before the record: {_state(best.options)}; {fall}."
+    fall = f"{_beside(taken, other)} than if it is {_state(other.options)}"
+    if taken.criterion > other.criterion:
+        fall += ", which is not decisive: a pole slower than the record is as flexible as a drift"
+    return f"State before the record: {_state(taken.options)}; {fall}."
 
 
 def _state(options: Searched) -> str:
@@ -94,32 +98,35 @@ def of_setting(models: Ranking, name: str) -> str:
     other = models.runner_up(name)
     fall = "nothing else could be tried"
     if other is not None:
-        fall = f"{_lower(models.best, other)} than with the runner-up, {other.value(name)}"
+        fall = f"{_beside(models.best, other)} than with the runner-up, {other.value(name)}"
     return f"{name.capitalize()}: {models.best.value(name)} (--{name}); {fall}."
 
 
-def of_grid(ranking: Ranking, taken: Candidate, delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
+def of_grid(
+    ranking: Ranking, taken: Candidate, few: bool, delays: tuple[float, float], given: Given, time_unit: str
+) -> list[str]:
     """Describe the structure and the range of the delay."""
     best, found = ranking.best, list[str]()
-    others = [each for each in ranking.candidates if each.fit is not taken.fit and not each.fit.poles_at_infinity]
-    if taken.held_back is not None and taken.fit is not best.fit:
-        beside = next(each for each in ranking.candidates if each.held_back and each.held_back.difference == 0.0)
-        assert beside.held_back is not None
-        fits = f"{taken.held_back.percent:.1f} and {beside.held_back.percent:.1f} %"
+    others = [each for each in ranking.candidates if each.fit is not taken.fit and each.is_proper]
+    lower = f"The criterion of {spelled(best.options)} is {shown(taken.criterion - best.criterion)} lower"
+    if others and taken.fit is best.fit:
+        runner = f"{_beside(taken, others[0])} than with the runner-up, {spelled(others[0].options)}"
+        found.append(f"Structure: {spelled(taken.options)}; {runner}.")
+    elif others and few:
         found.append(
-            f"Structure: {spelled(taken.options)}. The criterion of {spelled(beside.options)} is "
-            f"{taken.criterion - beside.criterion:.3g} lower, but its errors of held-back blocks are not significantly "
-            f"smaller: their fits are {fits}."
+            f"Structure: {spelled(taken.options)}. {lower}; as the input changes only a few times, that with the noise "
+            f"model of each structure decides, each parameter counted {OWN_PENALTY:g} times."
         )
-    elif others:
+    elif others and taken.held_back is not None and best.held_back is not None:
+        fits = f"{taken.held_back.percent:.1f} and {best.held_back.percent:.1f} %"
         found.append(
-            f"Structure: {spelled(taken.options)}; {_lower(taken, others[0])} than with the runner-up, "
-            f"{spelled(others[0].options)}."
+            f"Structure: {spelled(taken.options)}. {lower}, but its errors of held-back blocks are not significantly "
+            f"smaller: their fits are {fits}."
         )
     found += _of_integrators(ranking, taken)
     if not isinstance(given.poles, int | tuple) and given.modes is None and best.options.order >= MOST_POLES:
         found.append(
-            f"Structures with more than {MOST_POLES} poles were not tried (--poles 1:12 tries them); ctid frf shows "
+            f"Structures with more than {MOST_POLES} poles were not tried (--poles 1:12 tries more); ctid frf shows "
             "whether the record has more lightly damped modes."
         )
     return found + of_range(delays, given, time_unit)
@@ -142,7 +149,7 @@ def _of_integrators(ranking: Ranking, taken: Candidate) -> list[str]:
 
 def of_range(delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
     """Describe the range of the delay if it was chosen."""
-    if given.delays_given is not None:
+    if given.delay_bounds is not None or given.delays_of_inputs:
         return []
     return [f"Delay: searched from 0 to {delays[1]:g} {time_unit} (--delay)."]
 
@@ -154,8 +161,10 @@ def of_criterion(ranking: Ranking) -> str:
     return f"Criterion: BIC of the innovations with {noise} for all, each parameter counted {PENALTY:g} times."
 
 
-def _lower(best: Candidate, other: Candidate) -> str:
-    return f"the criterion is {shown(other.criterion - best.criterion)} lower"
+def _beside(one: Candidate, other: Candidate) -> str:
+    """Compare the criterion of a candidate with that of another one."""
+    fall = other.criterion - one.criterion
+    return f"the criterion is {shown(abs(fall))} {'lower' if fall >= 0.0 else 'higher'}"
 
 
 def shown(fall: float) -> str:

@@ -118,6 +118,10 @@ def young_information_criterion(residuals: Array, output: Array, estimates: Arra
 #: Penalty of a parameter over that in BIC. For 134 simulated records of known structure, models so chosen had at most
 #: 1.25 times the error of the true structure in 87 %, with BIC itself in 84 %.
 PENALTY = 1.5
+#: The same with a noise model of each structure itself. With 1.5, 2 and 3 the geometric mean of the errors of 28 models
+#: of simulated steps was .99, .96 and 1.01 of that with a common noise model; of 19 of thermal steps 3, 2 and none had
+#: oscillations.
+OWN_PENALTY = 2.0
 #: Very strong evidence for one of two models, as a difference of BIC, by Kass and Raftery (1995).
 DECISIVE = 10.0
 #: Directions of the sensitivities with less than this share of the greatest singular value are ignored.

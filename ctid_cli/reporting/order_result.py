@@ -34,8 +34,8 @@ ABOUT_NO_CANDIDATE = (
 ABOUT_HELD_BACK = (
     "- Held-back fit: ten blocks of the record, each predicted by a fit without its outputs. Difference: mean "
     "logarithm of the ratio of their mean squared errors to those of the structure of least criterion. The smallest "
-    "structure whose difference is at most its error, a standard error, is chosen; after a few steps from rest blocks "
-    "decide on the integrator only."
+    "structure whose difference is at most its error, a standard error, is chosen; after a few changes of the "
+    "input blocks decide on the integrator only."
 )
 #: Fit of held-back blocks, and difference of their errors from those of the structure that they are compared with.
 HELD_BACK = ("held_back_percent", "held_back_difference", "held_back_error")
