@@ -120,7 +120,18 @@ class Given:
         return any((one.poles, one.zeros, one.integrators) != (None,) * 3 for one in self.inputs or ())
 
     def delays_given(self, record: Record) -> tuple[float, float] | None:
-        """Return the range that contains the delays of all inputs of a record; None if one of them is to be chosen."""
+        """Return the range that contains the delays of all inputs of a record.
+
+        Parameters
+        ----------
+        record : Record
+            The record.
+
+        Returns
+        -------
+        tuple of float or None
+            Least and greatest delay [s]; None if one of them is to be chosen.
+        """
         own = {one.name: one.delay_bounds for one in self.inputs or ()}
         names = record.held if record.several else ("",)
         given = [self.delay_bounds if own.get(name) is None else own[name] for name in names]

@@ -112,7 +112,7 @@ def _of_choice(found: Identification, free: Given, time_unit: str) -> Iterator[s
     old, new = ([word for text in texts for word in text.split() if word.startswith("--")] for texts in (typed, after))
     dropped = list(dict.fromkeys(word for word in old if word not in new))
     words = " ".join(text for text in after if text not in before) or "the same options"
-    words += f" and without {listed(dropped)}" * bool(dropped)
+    words += f" and without {listed(dropped)}" if dropped else ""
     fits = f"{other.percent:.1f} instead of {own.percent:.1f} %"
     yield f"A free choice takes {spelled(choice.options)}: with {words} the held-back fit is {fits}"
 
