@@ -96,3 +96,11 @@ def test_many_coefficients_of_few_samples_are_noted_before_the_search(ctid, reco
     first, *others = ctid(f"fit {options} --delay 0", record, code=2).stderr.splitlines()
     assert ("18 coefficients are asked for, and 500 samples seldom determine them" in first) == noted
     assert [first, *others][-1] == "ctid: the search begins"
+
+
+def test_a_range_of_degrees_is_chosen_from(ctid, record, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = json.loads(ctid("fit", "record.csv", "--poles", "1:2", "--zeros", "0", "--json").stdout)
+    assert any(text.startswith("Structure: ") for text in found["choices"])
+    refused = ctid("fit", "record.csv", "--poles", "1:2", "--fix", "a1=1", code=2)
+    assert "--poles must be one number with --fix, not a range" in refused.stderr
