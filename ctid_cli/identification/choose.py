@@ -18,7 +18,7 @@ r"""Choice of what is not given: range of the delay, treatment of the records, h
    error. With few changes of the input, blocks decide on the integrator only.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, get_args
 
@@ -157,8 +157,8 @@ class _Choosing:
         )
         self.span = span._replace(integrators=(0,)) if self.ramps else span
         self.inputs = self._ranges_of_inputs()
-        self.first_hold: Holds = "zoh" if given.hold == "auto" else given.hold
-        self.first_hold = self._holds()[0]
+        #: Holds to compare, the first one with all treatments.
+        self.tried_holds = self._holds()
         #: Whether the input repeats: its range of delays is kept whole.
         self.repeats = False
         #: Delays of several inputs in the best small model, from which searches start [s], and fits of small models.
@@ -257,7 +257,7 @@ class _Choosing:
     ) -> Ranking:
         """Fit structures in several settings of the same records; another hold or offset starts at found models."""
         fits: dict[tuple[Setting, int], StructureFits] = {}
-        found = []
+        found = list[Candidate]()
         for setting in settings:
             progress.report("setting", len({each for each, _ in fits}) + 1, len(settings))
             for integrators, poles, zeros in structures:
@@ -268,8 +268,7 @@ class _Choosing:
                     near = None if known is None else known.model
                     near = near if start is None else lambda *_: start.fit.model
                     fits[key] = self._fits(records, *key[:1], delays, integrators, near)
-                fit = fits[key].fit(poles, zeros)
-                found += [] if fit is None else [Candidate(fit[0], setting.hold, *fit[1:])]
+                found += _candidates(fits[key], setting, [(poles, zeros)])
         self.near |= {k: own for (_, k), own in fits.items()} if self.several and not self.near else {}
         return ranked(self._not_empty(found), records, _treatment_of)
 
@@ -385,12 +384,11 @@ class _Choosing:
         kept = without_needless_drift(ranking, few_changes(common))
         self.gains = gains_of_treatments(kept)
         best = self._treated(kept, delays[1])
-        setting = Setting(self.first_hold, best.initial_state, best.input_before, best.offset)
-        holds = self._holds()
-        if len(holds) > 1:
+        setting = Setting(self.tried_holds[0], best.initial_state, best.input_before, best.offset)
+        if len(self.tried_holds) > 1:
             first = kept.of(initial_state=best.initial_state, input_before=best.input_before, offset=best.offset)
             start = (first or kept).best
-            tried = [setting._replace(hold=hold) for hold in holds]
+            tried = [setting._replace(hold=hold) for hold in self.tried_holds]
             compared = self._compared(common, tried, [structure_of(start)], delays, start)
             self.reasons.append(sentences.of_setting(compared, "hold"))
             setting = setting._replace(hold=compared.best.hold)
@@ -426,13 +424,15 @@ class _Choosing:
         if len(states) > 1 and not excited_after(self.part, latest):
             states = [state for state in states if state[0] != "estimate"]
         offset = self.given.offset or "estimate"
-        return [Setting(self.first_hold, state, before, offset) for state, before in states]
+        return [Setting(self.tried_holds[0], state, before, offset) for state, before in states]
 
     def _holds(self) -> list[Holds]:
         """Return the holds to compare; steps, and an input in a loop, count as held."""
+        if self.given.hold != "auto":
+            return [self.given.hold]
         moves = {input_moves(each).kind for record in self.records for each in record.each_input}
-        if self.given.hold != "auto" or moves != {"continuous"} or any(record.feedback for record in self.records):
-            return [self.first_hold]
+        if moves != {"continuous"} or any(record.feedback for record in self.records):
+            return ["zoh"]
         if not all(np.array_equal(one.t, record.t) for record in self.records for one in record.held.values()):
             return [self.records[0].hold]
         regular = all(record.interval is not None for record in self.part)
@@ -468,15 +468,13 @@ class _Choosing:
             return list(_sums(records, setting, delays, given.modes, given.integrators or 0))
         families = {k: self._fits(self.part, setting, delays, k) for k in self.span.integrators}
         if given.single:
-            own = [(families[k], poles, zeros) for k, poles, zeros in self._small(delays)]
-            return [Candidate(fit[0], setting.hold, *fit[1:]) for one, *each in own if (fit := one.fit(*each))]
+            return [one for k, *own in self._small(delays) for one in _candidates(families[k], setting, [own])]
         orders = self.span.orders(unasked=not isinstance(given.poles, int | tuple))
         for order in orders:
             progress.report("order", order, orders[-1])
             for k, family in families.items():
-                for each in self.span.structures(order, k, family.search.box.delay_free):
-                    fit = family.fit(*each)
-                    found += [] if fit is None else [Candidate(fit[0], setting.hold, *fit[1:])]
+                structures = self.span.structures(order, k, family.search.box.delay_free)
+                found += _candidates(family, setting, structures)
             if order >= FEWEST_TRIED and found:
                 ranking = ranked(found, records)
                 if order - ranking.best.options.order >= BEYOND:
@@ -485,6 +483,14 @@ class _Choosing:
                 ahead = {each.options.integrators for each in ranking.candidates if each.criterion < best + BEHIND}
                 families = {k: family for k, family in families.items() if k in ahead}
         return found
+
+
+def _candidates(fits: StructureFits, setting: Setting, structures: Iterable[Sequence[int]]) -> Iterator[Candidate]:
+    """Yield the fits of structures, poles and zeros, that can be fitted."""
+    for poles, zeros in structures:
+        if (found := fits.fit(poles, zeros)) is not None:
+            options, fit, size = found
+            yield Candidate(options, setting.hold, fit, size)
 
 
 def _sums(
@@ -613,9 +619,8 @@ def without_needless_drift(ranking: Ranking, few: bool) -> Ranking:
         return ranking
     constant = next((each for each in others if not each.options.integrators), None)
     if constant is not None and ranking.best.fit is drifting.fit:
-        criteria = [(each.criterion, own_criterion(each)) for each in (drifting, constant)]
-        falls = [other - one for one, other in zip(*criteria, strict=True)]
-        if falls[0] > DECISIVE and (not few or falls[1] > DECISIVE):
+        decisive = constant.criterion - drifting.criterion > DECISIVE
+        if decisive and (not few or own_criterion(constant) - own_criterion(drifting) > DECISIVE):
             return ranking
     return replace(ranking, candidates=others)
 

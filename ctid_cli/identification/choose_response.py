@@ -23,7 +23,7 @@ from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import CtidError, DataError, OptionError
 from ctid_cli.estimation.measured_lines import MeasuredLines, lines_of
 from ctid_cli.estimators.frequency_domain import FrequencyDomain, FrequencyDomainFit
-from ctid_cli.identification.choice import Given
+from ctid_cli.identification.choice import Given, Span
 from ctid_cli.identification.choose import rounded
 from ctid_cli.identification.criterion import BLOCKS, FOLDS, LEAST_SHARE, difference
 from ctid_cli.identification.response_structures import (
@@ -154,6 +154,7 @@ class _Choosing:
         given, families, found = self.given, self._families(), list[Judged]()
         poles = (given.poles, given.poles) if isinstance(given.poles, int) else given.poles or (0, GREATEST)
         zeros = (given.zeros, given.zeros) if isinstance(given.zeros, int) else given.zeros or (0, GREATEST)
+        span = Span(poles, zeros)
         most = poles[1] + max(family.options.integrators for family in families)
         asked = given.poles is not None
         order = 0
@@ -163,8 +164,8 @@ class _Choosing:
             tried = list[Judged]()
             for family in families:
                 known = family.options.delay_bounds[0] == family.options.delay_bounds[1]
-                proper = int(not known or (given.zeros is None and self._slope(first=False) < FLAT))
-                tried += family.tried(order, poles, zeros, proper)
+                proper = not known or (given.zeros is None and self._slope(first=False) < FLAT)
+                tried += family.tried(order, span, proper=proper)
             found += tried
             if not tried and found:
                 break
@@ -210,7 +211,7 @@ class _Choosing:
         each, half = list(found), self.lines.frequencies.size
         closest = min(each, key=lambda one: (not one.admissible, one.fit.cost)).fit
         residuals = np.split(closest.residuals[0], [half])
-        n, floor = closest.count, ROUNDING * float(self.lines.y_used @ self.lines.y_used)
+        n, rounding = closest.count, ROUNDING * float(self.lines.y_used @ self.lines.y_used)
         correlated = self.data.correlated if correlated is None else correlated
         noise = fit_noise_model(residuals, None if correlated else 0, float(np.log(n)))
         ranked = []
@@ -219,7 +220,7 @@ class _Choosing:
                 np.split(part, [half]) for part in (one.fit.residuals[0], one.fit.sensitivities[0] @ one.fit.tangent)
             )
             squared, own = squared_innovations(errors, psi, noise), innovations_count(residuals, noise)
-            value = own * np.log(max(squared, floor) / own) + PENALTY * one.parameters * np.log(own)
+            value = own * np.log(max(squared, rounding) / own) + PENALTY * one.parameters * np.log(own)
             ranked.append(one._replace(criterion=float(value)))
         return tuple(sorted(ranked, key=lambda one: (not one.admissible, one.criterion))), noise
 

@@ -223,8 +223,8 @@ def held_back(candidates: Sequence[tuple[Candidate, Sequence[Record]]]) -> list[
         return [None] * len(errors)
     steps = [resolution(y) ** 2 / 12 for y in outputs]
     least = LEAST_SHARE * min(float(squared.mean()) for squared in errors if squared is not None)
-    floor = np.maximum(np.repeat(steps, _blocks_each(used)), least)
-    sizes = [None if squared is None else np.log(np.maximum(squared, floor)) for squared in errors]
+    smallest = np.maximum(np.repeat(steps, _blocks_each(used)), least)
+    sizes = [None if squared is None else np.log(np.maximum(squared, smallest)) for squared in errors]
     lowest = min((size for size in sizes if size is not None), key=lambda size: float(size.mean()))
     total = float(np.mean(np.concatenate([y - y.mean() for y in outputs]) ** 2))
     found: list[HeldBack | None] = []

@@ -89,9 +89,9 @@ def identify(
         found = identification.identify(options, several, validation, *noise)
         likely = found.fit.assumed_hold.others if found.fit.assumed_hold else ()
         before = getattr(options, "input_before", None)
-        freely = Given(hold=several[0].hold, input_before=before if isinstance(before, float | int) else None)
-        freely = replace(freely, initial_state="periodic") if options.initial_state == "periodic" else freely
-        return with_warnings(joined_with_holds(found, likely), time_unit, freely)
+        level = before if isinstance(before, float | int) else None
+        known = Given(initial_state=options.initial_state, input_before=level, hold=several[0].hold)
+        return with_warnings(joined_with_holds(found, likely), time_unit, _free(known))
     given = options or Given()
     choice = choose(several, given, time_unit)
     if given.poles is None and not given.typed and not choice.has_model:
@@ -112,6 +112,10 @@ def identify(
     if other is not None:
         found = replace(found, validation=validated_on(other, choice.options, found.fit, given))
     typed = given.typed or isinstance(given.poles, int)
+    return with_warnings(found, time_unit, _free(given) if typed else None)
+
+
+def _free(given: Given) -> Given:
+    """Return the given options that a free choice keeps: what is known of the input, and the loss."""
     periodic = given.initial_state if given.initial_state == "periodic" else None
-    free = Given(initial_state=periodic, hold=given.hold, input_before=given.input_before, loss=given.loss)
-    return with_warnings(found, time_unit, free if typed else None)
+    return Given(initial_state=periodic, hold=given.hold, input_before=given.input_before, loss=given.loss)

@@ -14,7 +14,7 @@ from ctid_cli.estimation.optimum.best_model import best_of_orders
 from ctid_cli.estimation.optimum.box import Point, box_of, point_of
 from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch, with_added_poles
 from ctid_cli.estimators.frequency_domain import FrequencyDomain, FrequencyDomainFit, fit_of_lines
-from ctid_cli.identification.choice import Given
+from ctid_cli.identification.choice import UNDAMPED, Given, Span
 from ctid_cli.inference.covariance import LARGEST_CONDITION
 from ctid_cli.inference.residual_tests import all_white
 from ctid_cli.signals.frequency_data import FrequencyData
@@ -32,8 +32,6 @@ TRIED_PEAKS, DAMPINGS = 4, (0.02, 0.1)
 #: The range of the delay ends at this multiple of the greatest slope of the phase of at least this number of
 #: neighbouring lines, whose values are at least this multiple of their standard errors.
 REACH, NEIGHBOURS, ABOVE_NOISE = 1.5, 10, 5.0
-#: Names of the bounds at which a pole pair follows an error of single lines.
-UNDAMPED = frozenset({"least_damping", "imaginary"})
 #: Standard errors by which a peak stands out of its surroundings.
 CLEAR = 8.0
 
@@ -98,14 +96,12 @@ class Family:
         self.refusal: Exception | None = None
         self.searched = set[tuple[int, int]]()
 
-    def tried(self, order: int, poles: tuple[int, int], zeros: tuple[int, int], spare: int) -> Iterator[Judged]:
-        """Yield all structures of an order, integrators included, with at least ``spare`` more poles than zeros."""
-        own = order - self.options.integrators
-        if max(poles[0], int(not self.options.integrators)) <= own <= poles[1]:
-            for m in range(zeros[0], min(zeros[1], order - spare) + 1):
-                found = self._fit(own, m)
-                if found is not None:
-                    yield found
+    def tried(self, order: int, span: Span, *, proper: bool) -> Iterator[Judged]:
+        """Yield all structures of an order, integrators included; ``proper`` ones have more poles than zeros."""
+        for structure in span.structures(order, self.options.integrators, proper):
+            found = self._fit(*structure)
+            if found is not None:
+                yield found
 
     def _fit(self, poles: int, zeros: int) -> Judged | None:
         """Fit a structure; None if there are too few lines, or it does not have the known parameters."""

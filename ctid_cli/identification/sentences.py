@@ -139,10 +139,8 @@ def _of_integrators(ranking: Ranking, taken: Candidate) -> list[str]:
     if other is None or other.criterion > limit or isinstance(taken.options, AdditiveOutputError):
         return []
     what = "A slow pole instead of the integrator" if number else "An integrator instead of a slow pole"
-    difference = abs(other.criterion - taken.criterion)
-    side = "higher" if other.criterion >= taken.criterion else "lower"
     return [
-        f"{what} fits as well: the criterion of {spelled(other.options)} is {difference:.3g} {side} "
+        f"{what} fits as well: the criterion of {spelled(other.options)} is {_side(other, taken)} "
         f"(--integrators {other.options.integrators})."
     ]
 
@@ -163,8 +161,13 @@ def of_criterion(ranking: Ranking) -> str:
 
 def _beside(one: Candidate, other: Candidate) -> str:
     """Compare the criterion of a candidate with that of another one."""
+    return f"the criterion is {_side(one, other)}"
+
+
+def _side(one: Candidate, other: Candidate) -> str:
+    """Return by how much the criterion of a candidate is lower, or higher, than that of another one."""
     fall = other.criterion - one.criterion
-    return f"the criterion is {shown(abs(fall))} {'lower' if fall >= 0.0 else 'higher'}"
+    return f"{shown(abs(fall))} {'lower' if fall >= 0.0 else 'higher'}"
 
 
 def shown(fall: float) -> str:
