@@ -18,15 +18,15 @@ Then step records with a lead of 1, 5 and 15 samples are compared with the true 
 
 import argparse
 import itertools
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 from _timing import cpu
 
 import numpy as np
+from _rows import Rows
 
 from ctid_cli import DelayProfile, HeldSignal, Record, TransferFunction, choose, simulate
 from ctid_cli.errors import CtidError
@@ -251,20 +251,14 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=30)
     parser.add_argument("--seed", type=int, default=20261126)
     given = parser.parse_args()
-    rows = [json.loads(line) for line in given.file.read_text().splitlines()] if given.file.exists() else []
-    known = {(row["seed"], row["number"], row["step"]) for row in rows}
+    kept = Rows(given.file, "seed", "number", "step")
     cases = [drawn(given.seed, number) for number in range(given.first, given.first + given.records)]
     leads = list(steps(given.seed, given.steps))
-    with given.file.open("a") as file:
-        for case in (*cases, *leads):
-            if (case.seed, case.number, case.step) not in known:
-                rows.append(errors_of(case))
-                file.write(json.dumps(rows[-1]) + "\n")
-                file.flush()
-    of_case = {(row["seed"], row["number"], row["step"]): row for row in rows}
 
     def rows_of(some: list[Case]) -> list[dict[str, object]]:
-        return [of_case[case.seed, case.number, case.step] for case in some]
+        return [kept.row((case.seed, case.number, case.step), partial(errors_of, case)) for case in some]
+
+    rows_of([*cases, *leads])
 
     print(f"{'records':16}{'against':8}{'number':>6}{'<= 1.25':>8}{'<= 2':>8}  [%]")
     for name, belongs in GROUPS.items():

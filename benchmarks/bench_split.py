@@ -17,13 +17,14 @@ difference), and processor time of the choice.
 """
 
 import argparse
-import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from _timing import cpu
 
 import numpy as np
+from _rows import Rows
 
 from ctid_cli import DelayProfile, Given, HeldSignal, Record, choose, read_record, simulate
 from ctid_cli.errors import CtidError, DataError
@@ -116,14 +117,13 @@ def chosen(name, given, share):
     return row | {"first": float(100 * (1 - error)), "fit": fits(fit.model, record, hold, part.n_samples)}
 
 
-def known_lines(path):
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
-def added(path, row):
-    with path.open("a") as file:
-        file.write(json.dumps(row) + "\n")
-    return row
+def grid_row(name, data, row, share, poles):
+    """Return the best structures of a grid in several treatments."""
+    record, _ = read(data)
+    part, delays = first_part(record, share), tuple(row["delays"])
+    treatments = dict.fromkeys([tuple(row["treatment"]), *TREATMENTS])
+    seconds, found = cpu(grid, part, record, row["hold"], treatments, delays, poles)
+    return {"name": name, "share": share, "cpu": seconds, "found": found[:50]}
 
 
 def main():
@@ -134,24 +134,18 @@ def main():
     parser.add_argument("--share", type=float, default=0.6)
     parser.add_argument("--poles", type=int, default=6)
     given = parser.parse_args()
-    path = given.grid or given.file.with_suffix(".grid")
-    rows, grids = ({(row["name"], row["share"]): row for row in known_lines(each)} for each in (given.file, path))
+    files = given.file, given.grid or given.file.with_suffix(".grid")
+    rows, grids = (Rows(file, "name", "share") for file in files)
     print(f"{'record':36}{'chosen':>7} {'treatment':24}{'first':>7}{'rest':>7}  {'best':34}{'regret':>7}{'CPU s':>7}")
     regrets, spent = [], []
     for data in given.data:
         name = ",".join([Path(data.split(",")[0]).stem, *data.split(",")[1:]])
         key = name, given.share
-        row = rows[key] if key in rows else added(given.file, chosen(name, data, given.share))
+        row = rows.row(key, partial(chosen, name, data, given.share))
         if "message" in row:
             print(f"{name:36}{row['message']}")
             continue
-        if key not in grids:
-            record, _ = read(data)
-            treatments = dict.fromkeys([tuple(row["treatment"]), *TREATMENTS])
-            part, delays = first_part(record, given.share), tuple(row["delays"])
-            seconds, found = cpu(grid, part, record, row["hold"], treatments, delays, given.poles)
-            grids[key] = added(path, {"name": name, "share": given.share, "cpu": seconds, "found": found[:50]})
-        best, *what = grids[key]["found"][0]
+        best, *what = grids.row(key, partial(grid_row, name, data, row, given.share, given.poles))["found"][0]
         regrets.append(best - row["fit"])
         spent.append(row["cpu"])
         print(

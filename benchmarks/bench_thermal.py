@@ -20,13 +20,13 @@ point of fit against the reference. Each record adds a line to FILE (JSON); exis
 """
 
 import argparse
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from _timing import cpu
 
 import numpy as np
+from _rows import Rows
 
 from ctid_cli import DelayProfile, HeldSignal, Record, choose, simulate
 from ctid_cli.errors import CtidError
@@ -289,16 +289,10 @@ def main():
     parser.add_argument("--seed", type=int, default=101)
     parser.add_argument("--first", type=int, default=0)
     given = parser.parse_args()
-    lines = given.file.read_text().splitlines() if given.file.exists() else []
-    known = {(row["seed"], row["number"]): row for row in map(json.loads, lines)}
-    rows = []
+    kept, rows = Rows(given.file, "seed", "number"), []
     print(f"{'':4}{'chosen':>7} {'treatment':24}{'damping':>8}{'fit':>7}{'reference':>14}{'CPU s':>6}  faults (record)")
     for number in range(given.first, given.first + given.records):
-        if (given.seed, number) not in known:
-            row = known[given.seed, number] = row_of(drawn(given.seed, number))
-            with given.file.open("a") as file:
-                file.write(json.dumps(row) + "\n")
-        row = known[given.seed, number]
+        row = kept.row((given.seed, number), lambda number=number: row_of(drawn(given.seed, number)))
         rows.append(row)
         structure, best = max(row["reference"].items(), key=lambda each: each[1])
         about = f"{' '.join(sorted(faults(row))) or '-'} ({ingredients(row['case'])})"

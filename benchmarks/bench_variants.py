@@ -27,7 +27,6 @@ Each fit adds a line to FILE (JSON); existing ones are not computed again.
 """
 
 import argparse
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,6 +35,7 @@ from _timing import cpu
 
 import numpy as np
 from _kinds import Case, drawn_gain, drawn_system, square_record, step_record
+from _rows import Rows
 from bench_kinds import WELL, intervals_of, misses
 
 from ctid_cli import Given, HeldSignal, Record, TransferFunction, identify
@@ -185,20 +185,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--first", type=int, default=0)
     given = parser.parse_args()
-    lines = given.file.read_text().splitlines() if given.file.exists() else []
-    known = {(row["seed"], row["number"], row["fits"]): row for row in map(json.loads, lines)}
-    rows = []
+    kept, rows = Rows(given.file, "seed", "number", "fits"), []
     for number in range(given.first, given.first + given.records):
         kind = list(KINDS)[number % len(KINDS)]
         variant = KINDS[kind](np.random.default_rng([given.seed, number]))
         for fits, options in {"free": Given(), **variant.typed}.items():
+            about = {"seed": given.seed, "number": number, "kind": kind, "fits": fits}
             key = given.seed, number, fits
-            if key not in known:
-                about = {"seed": given.seed, "number": number, "kind": kind, "fits": fits}
-                known[key] = about | row_of(variant, options)
-                with given.file.open("a") as file:
-                    file.write(json.dumps(known[key]) + "\n")
-            rows.append(known[key])
+            rows.append(kept.row(key, lambda known=about, given=options, of=variant: known | row_of(of, given)))
     print_table(rows)
 
 
